@@ -1,0 +1,60 @@
+"""3D trajectories of animals from 2D keypoints and calibrated cameras.
+
+The names below are the public interface. They are imported on first use, so that
+``import acino_fte`` costs next to nothing.
+
+Examples
+--------
+>>> import acino_fte as af                                       # doctest: +SKIP
+>>> sequence = af.load_sequence("examples/cheetah_gallop")       # doctest: +SKIP
+>>> kinematics = af.load_kinematics(af.load_skeleton("cheetah")) # doctest: +SKIP
+>>> problem = af.build_fte(sequence, kinematics)                 # doctest: +SKIP
+>>> result = af.solve_fte(problem, af.initialise(sequence, kinematics))  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "InputError": "errors",
+    "Camera": "cameras",
+    "CameraArray": "cameras",
+    "Sequence": "sequence",
+    "Skeleton": "skeleton",
+    "load_skeleton": "skeleton",
+    "Kinematics": "kinematics",
+    "load_kinematics": "kinematics",
+    "FTEOptions": "problem",
+    "FTEProblem": "problem",
+    "build_fte": "problem",
+    "initialise": "initialise",
+    "SolveOptions": "solve",
+    "solve_fte": "solve",
+    "FTEResult": "result",
+    "Status": "result",
+    "load_sequence": "data_tools.load",
+}
+
+__all__ = ["__version__", *_PUBLIC]
+
+# In a checkout the packages acino_fte.models and acino_fte.data_tools are sibling folders of this
+# one; an installed copy has them inside and does not need this line.
+_checkout = Path(__file__).resolve().parent.parent
+if (_checkout / "models" / "__init__.py").is_file() and (_checkout / "pyproject.toml").is_file():
+    __path__.append(str(_checkout))
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use (PEP 562)."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'acino_fte' has no attribute {name!r}")
+    return getattr(import_module(f"acino_fte.{_PUBLIC[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,34 @@
+"""The command ``acino-fte``. Heavy imports wait inside the commands, so that ``--help`` is instant."""
+
+from __future__ import annotations
+
+import typer
+
+from acino_fte import cli_run, cli_simulate, cli_skeleton
+
+app = typer.Typer(
+    name="acino-fte",
+    help="3D trajectories of animals from 2D keypoints and calibrated cameras.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_show_locals=False,
+)
+app.command("run")(cli_run.run)
+app.command("simulate")(cli_simulate.simulate)
+app.add_typer(cli_skeleton.app, name="skeleton")
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: bool = typer.Option(False, "--version", help="Print the version and leave.", is_eager=True),
+) -> None:
+    if version:
+        from acino_fte import __version__
+
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+def main() -> None:
+    """Entry point of the command."""
+    app()

@@ -1,0 +1,113 @@
+"""What a recording becomes once it is read: detections, cameras and frame rate, one frozen value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acino_fte.cameras import CameraArray
+from acino_fte.errors import InputError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """A recording of one animal.
+
+    Attributes
+    ----------
+    name : str
+    species : str
+        Name of a species, or the path of a species file.
+    fps : float
+        Frames per second.
+    detections : xarray.Dataset
+        ``position`` (frame, camera, marker, space = u, v), px, NaN where missing, and ``likelihood``
+        (frame, camera, marker). The coordinate ``frame`` counts from the start of the recording.
+    cameras : CameraArray
+        In the order of the dimension ``camera``; moving cameras have one pose per frame of this range.
+    truth : xarray.DataArray, optional
+        True marker positions (frame, marker, space = x, y, z), m, when known.
+    provenance : dict
+        The sequence as it was understood, ready to be written as ``sequence.yaml``.
+    warnings : tuple of str
+        What the reader wants the user to know.
+    """
+
+    name: str
+    species: str
+    fps: float
+    detections: xr.Dataset
+    cameras: CameraArray
+    truth: xr.DataArray | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        found = [str(c) for c in self.detections.camera.values]
+        if found != self.cameras.names:
+            raise InputError(
+                "Cameras and detections do not belong together.",
+                expected=f"cameras {', '.join(self.cameras.names)}",
+                found=", ".join(found),
+            )
+
+    @property
+    def n_frames(self) -> int:
+        """N."""
+        return self.detections.sizes["frame"]
+
+    @property
+    def frames(self) -> np.ndarray:
+        """(N,) frame numbers, counted from the start of the recording."""
+        return self.detections.frame.values
+
+    @property
+    def markers(self) -> list[str]:
+        """Marker names that the detections have."""
+        return [str(m) for m in self.detections.marker.values]
+
+    @property
+    def duration(self) -> float:
+        """Length of the recording, s."""
+        return self.n_frames / self.fps
+
+    def pixels(self, markers: list[str], likelihood: float) -> np.ndarray:
+        """Detections (N, C, M, 2) px of the given markers with a likelihood above a threshold, else NaN."""
+        chosen = self.detections.reindex(marker=markers)
+        position = chosen.position.transpose("frame", "camera", "marker", "space").values
+        sure = chosen.likelihood.transpose("frame", "camera", "marker").values > likelihood
+        return np.where(sure[..., None] & np.isfinite(position).all(-1, keepdims=True), position, np.nan)
+
+    def select_frames(self, start: int | None, stop: int | None) -> Sequence:
+        """Frames start ≤ frame < stop, numbered from the start of the recording.
+
+        Raises
+        ------
+        InputError
+            The range is empty or reaches outside the recording.
+        """
+        first, last = int(self.frames[0]), int(self.frames[-1]) + 1
+        start = first if start is None else start
+        stop = last if stop is None else stop
+        if not first <= start < stop <= last:
+            raise InputError(
+                f"The frames {start}:{stop} are not in the recording.",
+                key="frames",
+                expected=f"START:STOP with {first} ≤ START < STOP ≤ {last} (half-open, counted from 0)",
+                found=f"{start}:{stop}",
+                remedy="choose a range inside, or leave it out to use every frame",
+            )
+        cut = slice(start - first, stop - first)
+        truth = self.truth.isel(frame=cut) if self.truth is not None else None
+        return replace(
+            self,
+            detections=self.detections.isel(frame=cut),
+            cameras=self.cameras.at_frames(cut),
+            truth=truth,
+            provenance={**self.provenance, "frames": [start, stop]},
+        )
