@@ -1,0 +1,317 @@
+"""A result on disk: a labelled dataset, tables, metrics, figures and a report, whole or not at all.
+
+The files are written to a temporary folder ``.NAME.tmp-…`` beside the output folder, which takes the output
+folder's name at the end. A run that fails or is killed on the way leaves the output folder as it was.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from secrets import token_hex
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+import yaml
+
+from acino_fte.errors import InputError
+from acino_fte.metrics import json_safe
+
+if TYPE_CHECKING:
+    from acino_fte.result import FTEResult
+
+FILES = ("fte.nc", "positions.csv", "states.csv", "metrics.json", "sequence.yaml", "figures", "report.html")
+"""What a result folder may hold."""
+_MARKS = ("fte.nc", "metrics.json")  # a folder that holds both is a result
+_ANOTHER = "choose another output folder with -o"
+
+
+def to_dataset(result: FTEResult) -> xr.Dataset:
+    """Everything as one labelled dataset, in the layout of the movement package.
+
+    Parameters
+    ----------
+    result : FTEResult
+        In whatever status it is.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``position`` (time, space, keypoints, individuals), m, world frame; ``confidence`` (time,
+        keypoints, individuals), mean likelihood of the detections used, NaN where there was none;
+        ``n_views`` likewise, how many there were; ``q``, ``dq``, ``ddq`` (time, dof), m and rad as the
+        coordinate ``dof_unit`` says; ``detection`` and ``residual`` = reprojected − detected (time,
+        camera, keypoints, pixel), px. Coordinates ``time`` (s, from the start of the recording) and
+        ``frame`` along it. The attributes carry status, fps, method, version, units and options.
+
+    References
+    ----------
+    The movement package (Sirmpilatze et al., Zenodo, doi:10.5281/zenodo.12755724): dataset of type poses.
+    """
+    seen = np.isfinite(result.observed).all(-1)
+    keypoints = ("time", "keypoints", "individuals")
+    pixels = ("time", "camera", "keypoints", "pixel")
+    position = result.positions.transpose(0, 2, 1)[..., None]
+    confidence = _confidence(result, seen)[..., None]
+    variables = {
+        "position": (("time", "space", *keypoints[1:]), position, _note("position, world frame", "m")),
+        "confidence": (keypoints, confidence, _note("mean likelihood of the detections used", "1")),
+        "n_views": (keypoints, seen.sum(axis=1)[..., None], _note("cameras that saw the marker", "1")),
+        "q": (("time", "dof"), result.q, _note("degrees of freedom", "see dof_unit")),
+        "dq": (("time", "dof"), result.dq, _note("first time derivative of q", "see dof_unit, per s")),
+        "ddq": (("time", "dof"), result.ddq, _note("second time derivative of q", "see dof_unit, per s^2")),
+        "detection": (pixels, result.observed, _note("detections that entered the problem", "px")),
+        "residual": (pixels, result.residuals, _note("reprojected minus detected", "px")),
+    }
+    return xr.Dataset(variables, _coordinates(result), _attributes(result))
+
+
+def _note(text: str, units: str) -> dict[str, str]:
+    return {"long_name": text, "units": units}
+
+
+def _confidence(result: FTEResult, seen: np.ndarray) -> np.ndarray:
+    """(N, M) mean likelihood of the detections that entered the problem; NaN without one."""
+    detections = result.sequence.detections.reindex(marker=result.skeleton.marker_names)
+    likelihood = detections.likelihood.transpose("frame", "camera", "marker").values
+    n_views = seen.sum(axis=1)
+    total = np.where(seen, likelihood, 0.0).sum(axis=1)
+    return np.where(n_views > 0, total / np.maximum(n_views, 1), np.nan)
+
+
+def _coordinates(result: FTEResult) -> dict[str, Any]:
+    frames = np.asarray(result.sequence.frames)
+    dofs = result.skeleton.dofs
+    return {
+        "time": ("time", frames / result.sequence.fps, _note("time from the start of the recording", "s")),
+        "frame": ("time", frames, {"long_name": "frame, counted from 0 at the start of the recording"}),
+        "space": ["x", "y", "z"],
+        "keypoints": result.skeleton.marker_names,
+        "individuals": ["id_0"],
+        "dof": result.skeleton.dof_names,
+        "dof_unit": ("dof", [dof.unit for dof in dofs]),
+        "dof_lower": ("dof", [dof.lower for dof in dofs], _note("lower limit", "see dof_unit")),
+        "dof_upper": ("dof", [dof.upper for dof in dofs], _note("upper limit", "see dof_unit")),
+        "camera": result.sequence.cameras.names,
+        "pixel": ["u", "v"],
+    }
+
+
+def _attributes(result: FTEResult) -> dict[str, Any]:
+    """Attributes that netCDF can hold: texts and numbers."""
+    from acino_fte import __version__
+
+    return {
+        "ds_type": "poses",
+        "source_software": "acino_fte",
+        "version": __version__,
+        "status": str(result.status),
+        "converged": int(result.status.ok),
+        "advice": result.status.advice,
+        "sequence": result.sequence.name,
+        "species": result.skeleton.name,
+        "method": result.method,
+        "fps": float(result.sequence.fps),
+        "time_unit": "seconds",
+        "units": "m, rad, s, px",
+        "objective": float(result.objective),
+        "iterations": int(result.iterations),
+        "options": json.dumps(json_safe(result.options)),
+    }
+
+
+def check_output_folder(out: Path | str, *, input_folder: Path | str | None = None) -> Path:
+    """Refuse an output folder before a long run rather than after it.
+
+    Parameters
+    ----------
+    out : Path
+        Where the result shall go. It may be absent, empty, or an earlier result, which will be replaced.
+    input_folder : Path, optional
+        The sequence (a folder, or a file in it), which is never written to.
+
+    Returns
+    -------
+    Path
+        The folder with symbolic links resolved.
+
+    Raises
+    ------
+    InputError
+        The folder holds something else, cannot be made, or would touch the input.
+    """
+    folder = Path(out).expanduser().resolve()
+    if input_folder is not None:
+        _check_apart(folder, Path(input_folder).expanduser().resolve())
+    if folder.exists() and not folder.is_dir():
+        raise InputError("The output is a file, not a folder.", file=folder, remedy=_ANOTHER)
+    parent = next(p for p in folder.parents if p.exists())
+    if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+        raise InputError(
+            "The output folder cannot be made.",
+            file=folder,
+            expected=f"a folder at {parent} in which you may write",
+            found="a file" if not parent.is_dir() else "no permission to write",
+            remedy=_ANOTHER,
+        )
+    if folder.is_dir():
+        _check_ours(folder)
+    return folder
+
+
+def _check_apart(folder: Path, source: Path) -> None:
+    """The output may neither be, nor lie in, nor hold the input."""
+    source = source.parent if source.is_file() else source
+    relation = None
+    if folder == source:
+        relation = "is the input folder"
+    elif source in folder.parents:
+        relation = "lies inside the input folder"
+    elif folder in source.parents and folder.exists():
+        relation = "holds the input folder"
+    if relation:
+        raise InputError(
+            f"The output folder {relation}, which is never written to.",
+            file=folder,
+            expected=f"a folder apart from {source}",
+            remedy=_ANOTHER,
+        )
+
+
+def _check_ours(folder: Path) -> None:
+    """An existing folder may be empty or an earlier result with nothing added to it."""
+    entries = sorted(p.name for p in folder.iterdir())
+    if not entries:
+        return
+    foreign = [name for name in entries if name not in FILES and not name.startswith(".")]
+    result = all((folder / name).is_file() for name in _MARKS)
+    if not result or foreign:
+        listed = ", ".join((foreign or entries)[:5]) + (", …" if len(foreign or entries) > 5 else "")
+        raise InputError(
+            "The output folder holds files that are not a result of this program, and would be lost."
+            if not result
+            else "The output folder holds an earlier result with other files added, which would be lost.",
+            file=folder,
+            expected="a new or empty folder, or an earlier result (which is replaced)",
+            found=listed,
+            remedy=f"{_ANOTHER}, or move these files away",
+        )
+
+
+def save_result(
+    result: FTEResult,
+    out: Path | str,
+    *,
+    figures: bool = True,
+    input_folder: Path | str | None = None,
+) -> Path:
+    """Write a result folder; it is whole or it is not there.
+
+    Parameters
+    ----------
+    result : FTEResult
+        In whatever status it is; the status is in every file that has room for it.
+    out : Path
+        See :func:`check_output_folder`. An earlier result is replaced once the new one is complete.
+    figures : bool
+        Whether to draw the figures; without them the report has only tables and the viewer.
+    input_folder : Path, optional
+        The sequence, which is never written to.
+
+    Returns
+    -------
+    Path
+        The folder: ``fte.nc``, ``positions.csv``, ``states.csv``, ``metrics.json``, ``sequence.yaml``,
+        ``figures/``, ``report.html``.
+
+    Raises
+    ------
+    InputError
+        The folder may not be written; see :func:`check_output_folder`.
+    """
+    folder = check_output_folder(out, input_folder=input_folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    working = folder.with_name(f".{folder.name}.tmp-{token_hex(4)}")
+    working.mkdir()
+    try:
+        write_tables(result, working)
+        if figures:
+            from acino_fte.plots import save_figures
+
+            save_figures(result, working / "figures")
+        from acino_fte.report import write_report
+
+        write_report(result, working)
+        _check_again(folder)
+        _swap(working, folder)
+    finally:
+        shutil.rmtree(working, ignore_errors=True)
+    return folder
+
+
+def _check_again(folder: Path) -> None:
+    """Something may have been put into the output folder while the run lasted."""
+    if folder.is_dir():
+        _check_ours(folder)
+
+
+def _swap(new: Path, folder: Path) -> None:
+    """Give ``new`` the name ``folder``; the old folder is kept until then, and put back on failure."""
+    if not folder.exists():
+        new.rename(folder)
+        return
+    old = folder.with_name(f".{folder.name}.old-{token_hex(4)}")
+    folder.rename(old)
+    try:
+        new.rename(folder)
+    except BaseException:
+        old.rename(folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def write_tables(result: FTEResult, folder: Path) -> None:
+    """Write everything but figures and report into an existing folder."""
+    dataset = to_dataset(result)
+    packed = {"zlib": True, "complevel": 1}
+    encoding = {str(name): packed for name, v in dataset.data_vars.items() if v.dtype.kind == "f"}
+    dataset.to_netcdf(folder / "fte.nc", engine="h5netcdf", encoding=encoding)
+    _write_positions(result, folder / "positions.csv")
+    _write_states(result, folder / "states.csv")
+    text = json.dumps(result.metrics, indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
+    provenance = yaml.safe_dump(
+        json_safe(result.sequence.provenance), sort_keys=False, allow_unicode=True, width=100
+    )
+    (folder / "sequence.yaml").write_text(provenance, encoding="utf-8")
+
+
+def _write_positions(result: FTEResult, path: Path) -> None:
+    """Columns frame, time_s, marker, x, y, z (m, world frame), one row for a marker in a frame."""
+    import pandas as pd
+
+    frames = np.asarray(result.sequence.frames)
+    n_frames, n_markers = result.positions.shape[:2]
+    table = pd.DataFrame(
+        {
+            "frame": np.repeat(frames, n_markers),
+            "time_s": np.repeat(frames / result.sequence.fps, n_markers),
+            "marker": np.tile(result.skeleton.marker_names, n_frames),
+            **{axis: result.positions[..., i].ravel() for i, axis in enumerate("xyz")},
+        }
+    )
+    table.to_csv(path, index=False, float_format="%.6f")
+
+
+def _write_states(result: FTEResult, path: Path) -> None:
+    """Columns frame, time_s and every degree of freedom (m, rad), one row for a frame."""
+    import pandas as pd
+
+    frames = np.asarray(result.sequence.frames)
+    table = pd.DataFrame(result.q, columns=result.skeleton.dof_names)
+    table.insert(0, "frame", frames)
+    table.insert(1, "time_s", frames / result.sequence.fps)
+    table.to_csv(path, index=False, float_format="%.9g")

@@ -1,0 +1,112 @@
+"""A small FTEResult without a solver: a cheetah gallops past a row of cameras."""
+
+import numpy as np
+import xarray as xr
+
+from acino_fte.cameras import Camera, CameraArray
+from acino_fte.kinematics import load_kinematics
+from acino_fte.result import FTEResult, Status
+from acino_fte.sequence import Sequence
+from acino_fte.skeleton import load_skeleton
+
+FPS = 120.0
+
+
+def make_cameras(n):
+    cameras = []
+    for c in range(n):
+        x = -1.0 + 14.0 * (c // 2) / max(1, (n - 1) // 2)
+        centre = np.array([x, -6.0 if c % 2 == 0 else 6.0, 1.2])
+        forward = np.array([5.0, 0.0, 0.6]) - centre
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        matrix = np.array([[1200.0, 0, 1352], [0, 1200, 760], [0, 0, 1]])
+        cameras.append(
+            Camera(f"cam{c + 1}", "fisheye", matrix, np.zeros(4), rotation, -rotation @ centre, (2704, 1520))
+        )
+    return CameraArray(tuple(cameras))
+
+
+def gallop(skeleton, n_frames, speed=13.0):
+    """Degrees of freedom (N, Q) of something like a gallop, inside every limit."""
+    time = np.arange(n_frames) / FPS
+    q = np.zeros((n_frames, len(skeleton.dofs)))
+    for j, dof in enumerate(skeleton.dofs):
+        if np.isfinite(dof.lower):
+            swing = min(0.25 * (dof.upper - dof.lower), 0.45)
+            centre = np.clip(0.0, dof.lower + 1.2 * swing, dof.upper - 1.2 * swing)
+            q[:, j] = centre + swing * np.sin(2 * np.pi * 3.0 * time + 1.3 * j)
+    q[:, skeleton.dof("head.x")] = speed * time
+    q[:, skeleton.dof("head.z")] = 0.85 + 0.05 * np.sin(2 * np.pi * 3.0 * time)
+    q[:, skeleton.dof("head.yaw")] = 0.15 * np.sin(2 * np.pi * 0.5 * time)
+    return q
+
+
+def make_result(
+    n_frames=12,
+    n_cameras=3,
+    noise=3.0,
+    outliers=0.03,
+    missing=0.3,
+    start=80,
+    status=Status.CONVERGED,
+    truth=True,
+    seed=0,
+    warnings=(),
+):
+    skeleton = load_skeleton("cheetah")
+    kinematics = load_kinematics(skeleton)
+    rng = np.random.default_rng(seed)
+    q = gallop(skeleton, n_frames)
+    positions = kinematics.positions(q)
+    cameras = make_cameras(n_cameras)
+    reprojected = cameras.project(positions)
+    observed = reprojected + rng.normal(0, noise, reprojected.shape)
+    wild = rng.random(observed.shape[:3]) < outliers
+    observed[wild] += rng.normal(0, 150, (wild.sum(), 2))
+    inside = np.stack([camera.inside(observed[:, c]) for c, camera in enumerate(cameras)], axis=1)
+    observed[(rng.random(observed.shape[:3]) < missing) | ~inside] = np.nan
+    frames = np.arange(start, start + n_frames)
+    labels = {"frame": frames, "camera": cameras.names, "marker": skeleton.marker_names}
+    likelihood = np.where(np.isfinite(observed).all(-1), 0.9, 0.1)
+    detections = xr.Dataset(
+        {
+            "position": (("frame", "camera", "marker", "space"), observed),
+            "likelihood": (("frame", "camera", "marker"), likelihood),
+        },
+        {**labels, "space": ["u", "v"]},
+    )
+    true = xr.DataArray(
+        positions + rng.normal(0, 0.002, positions.shape),
+        dims=("frame", "marker", "space"),
+        coords={"frame": frames, "marker": skeleton.marker_names, "space": ["x", "y", "z"]},
+    )
+    sequence = Sequence(
+        name="gallop",
+        species="cheetah",
+        fps=FPS,
+        detections=detections,
+        cameras=cameras,
+        truth=true if truth else None,
+        provenance={"species": "cheetah", "fps": FPS, "frames": [start, start + n_frames]},
+        warnings=tuple(warnings),
+    )
+    dq = np.gradient(q, 1 / FPS, axis=0) if n_frames > 1 else np.zeros_like(q)
+    return FTEResult(
+        status=status,
+        sequence=sequence,
+        skeleton=skeleton,
+        q=q,
+        dq=dq,
+        ddq=np.zeros_like(q),
+        positions=positions,
+        observed=observed,
+        reprojected=reprojected,
+        objective=123.5,
+        iterations=9,
+        method="fte-condensed",
+        seconds={"load": 0.5, "initialise": 0.02, "build": 0.01, "solve": 0.07},
+        options={"likelihood": 0.5, "loss": "redescending", "solve": {"max_iter": 200}},
+    )
