@@ -1,0 +1,114 @@
+"""``sequence.yaml``: what belongs to one recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from acino_fte.errors import InputError
+from acino_fte.species_file import read_yaml, validation_message
+
+FORMAT = "acino-fte/sequence/1"
+FILE_NAME = "sequence.yaml"
+
+
+class SequenceFile(BaseModel):
+    """The content of a ``sequence.yaml``. Paths are relative to the folder of the file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    format: Literal["acino-fte/sequence/1"] = FORMAT
+    name: str | None = Field(None, description="name of the recording; by default that of its folder")
+    species: str | None = Field(None, description="a species, or the path of a species file (.yaml)")
+    fps: float | None = Field(None, gt=0, description="frames per second")
+    cameras: str = Field(description="camera file: cameras.json, an AcinoSet scene, or Anipose's TOML")
+    camera_unit: Literal["m", "cm", "mm"] = Field("m", description="unit of the translations in that file")
+    keypoints: dict[str, str] = Field(min_length=1, description="keypoint file (.csv or .h5) by camera name")
+    frames: tuple[int, int] | None = Field(None, description="start and stop, half-open, counted from 0")
+    truth: str | None = Field(None, description="CSV with frame, marker, x, y, z (m) where they are known")
+
+    @field_validator("keypoints", mode="before")
+    @classmethod
+    def _text_keys(cls, value: Any) -> Any:
+        """YAML reads a camera called 1 as a number."""
+        return {str(k): v for k, v in value.items()} if isinstance(value, dict) else value
+
+    @field_validator("frames")
+    @classmethod
+    def _rising(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        if value is not None and not 0 <= value[0] < value[1]:
+            raise ValueError(f"frames {list(value)} must be [start, stop] with 0 ≤ start < stop")
+        return value
+
+    def at(self, folder: Path) -> SequenceFile:
+        """The same with absolute paths, read from a file in `folder`."""
+
+        def absolute(path: str) -> str:
+            return str((folder / Path(path).expanduser()).resolve())
+
+        species = self.species
+        if species is not None and species.endswith((".yaml", ".yml")):
+            species = absolute(species)
+        update = {
+            "species": species,
+            "cameras": absolute(self.cameras),
+            "keypoints": {name: absolute(path) for name, path in self.keypoints.items()},
+            "truth": absolute(self.truth) if self.truth is not None else None,
+        }
+        return self.model_copy(update=update)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, in the order of the schema, without what is not set."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+
+def read_sequence_file(path: Path | str) -> SequenceFile:
+    """Read and validate a ``sequence.yaml``; its paths become absolute.
+
+    Raises
+    ------
+    InputError
+        The file is missing, is not YAML, or does not follow the schema.
+    """
+    path = Path(path)
+    data = read_yaml(path)
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise InputError(
+            "This is not a sequence file of a format that this version reads.",
+            file=path,
+            key="format",
+            expected=FORMAT,
+            found=repr(data.get("format")) if isinstance(data, dict) else type(data).__name__,
+            remedy=f"write 'format: {FORMAT}' as its first line",
+        )
+    try:
+        return SequenceFile.model_validate(data).at(path.resolve().parent)
+    except ValidationError as error:
+        place, text = validation_message(error, SequenceFile)
+        raise InputError(
+            f"The sequence file has a fault at '{place}': {text}.",
+            file=path,
+            key=place,
+            remedy="mend that key",
+        ) from None
+
+
+def write_sequence_file(path: Path | str, content: SequenceFile | dict[str, Any]) -> None:
+    """Write a ``sequence.yaml``. Relative paths in it are meant from the folder of `path`.
+
+    Raises
+    ------
+    InputError
+        The content does not follow the schema.
+    """
+    path = Path(path)
+    try:
+        file = content if isinstance(content, SequenceFile) else SequenceFile.model_validate(content)
+    except ValidationError as error:
+        place, text = validation_message(error, SequenceFile)
+        raise InputError(f"The sequence has a fault at '{place}': {text}.", file=path, key=place) from None
+    text = yaml.safe_dump(file.to_dict(), sort_keys=False, allow_unicode=True, width=110)
+    path.write_text(text, encoding="utf-8")
