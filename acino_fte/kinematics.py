@@ -69,6 +69,16 @@ class Kinematics:
             result[m, self.skeleton.ancestors(marker.link)] = True
         return result
 
+    @cached_property
+    def before(self) -> np.ndarray:
+        """(Q, Q) bool: whether i acts on a chain at or before j (where second derivatives live)."""
+        result = np.eye(self.n_dofs, dtype=bool)
+        for link in range(len(self.skeleton.links)):
+            chain = self.skeleton.ancestors(link)
+            for place, i in enumerate(chain):
+                result[i, chain[place:]] = True
+        return result
+
     def positions(self, q: np.ndarray) -> np.ndarray:
         """Marker positions, (N, M, 3) in m, from q (N, Q)."""
         q = np.asarray(q, dtype=float)

@@ -1,0 +1,152 @@
+"""The full trajectory estimation problem, stated but not solved.
+
+Minimise over q (N, Q), within its bounds, the negative log-posterior
+
+    Σ_frames,cameras,markers ρ(|π(p(q)) − z|/σ_px)  +  ½ Σ (w/σ_w)²  +  ½ Σ ((q − mean)/σ_prior)²,
+
+with w the jump of acceleration from frame to frame (Joska et al. 2021, eq. 4–9, with the ½ of a Gaussian
+likelihood, so that the curvature at the optimum is an information matrix).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from acino_fte.errors import InputError
+from acino_fte.kinematics import Kinematics
+from acino_fte.losses import Loss
+from acino_fte.sequence import Sequence
+from acino_fte.terms import Term, measurement_term, model_term, prior_term
+
+
+@dataclass(frozen=True)
+class FTEOptions:
+    """Options of the trajectory problem.
+
+    Attributes
+    ----------
+    likelihood : float
+        Detections count when their likelihood is above this (0–1).
+    loss : Loss
+        Loss of the measurements.
+    noise_scale : float
+        Factor on the process noise of the species: above 1 follows the data more closely, below 1
+        gives smoother motion.
+    prior_width : float
+        Width of the joint-angle prior in units of half the joint's range; 0 leaves it out.
+    """
+
+    likelihood: float = 0.5
+    loss: Loss = field(default_factory=Loss)
+    noise_scale: float = 1.0
+    prior_width: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name, value, good in (
+            ("likelihood", self.likelihood, 0.0 <= self.likelihood <= 1.0),
+            ("noise_scale", self.noise_scale, self.noise_scale > 0),
+            ("prior_width", self.prior_width, self.prior_width >= 0),
+        ):
+            if not good:
+                raise InputError(f"The option {name} cannot be {value}.", key=name, remedy="see --help")
+
+    def summary(self) -> dict[str, Any]:
+        """The options as plain values for the record."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, eq=False)
+class FTEProblem:
+    """A trajectory problem: terms over q (N, Q) and bounds. Made by :func:`build_fte`, solved elsewhere.
+
+    Attributes
+    ----------
+    kinematics : Kinematics
+    fps : float
+        Frames per second.
+    frames : (N,) int
+        Frame numbers, for labels.
+    terms : tuple of Term
+    lower, upper : (Q,)
+        Bounds of every frame's q, m and rad.
+    """
+
+    kinematics: Kinematics
+    fps: float
+    frames: np.ndarray
+    terms: tuple[Term, ...]
+    lower: np.ndarray
+    upper: np.ndarray
+
+    @property
+    def n_frames(self) -> int:
+        """N."""
+        return len(self.frames)
+
+    @property
+    def dt(self) -> float:
+        """Time between frames, s."""
+        return 1.0 / self.fps
+
+    @cached_property
+    def n_observations(self) -> int:
+        """Number of detections that enter the problem."""
+        return sum(len(t) for t in self.terms if t.family == "meas")
+
+    def clip(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """Push q (N, Q) into its bounds, ``margin`` times the range away from them."""
+        width = np.where(np.isfinite(self.upper - self.lower), self.upper - self.lower, 0.0)
+        return np.clip(q, self.lower + margin * width, self.upper - margin * width)
+
+    def with_terms(self, *terms: Term) -> FTEProblem:
+        """The same problem with more terms."""
+        return FTEProblem(
+            self.kinematics, self.fps, self.frames, (*self.terms, *terms), self.lower, self.upper
+        )
+
+
+def build_problem(
+    kinematics: Kinematics, fps: float, frames: np.ndarray, terms: list[Term], options: FTEOptions
+) -> FTEProblem:
+    """Add motion model, prior and bounds to terms that hold the data."""
+    skeleton, n = kinematics.skeleton, len(frames)
+    if n > 3:
+        model = model_term(skeleton, n, fps)
+        terms = [*terms, Term(**{**vars(model), "sd": model.sd * options.noise_scale})]
+    if options.prior_width > 0:
+        terms = [*terms, prior_term(skeleton, n, options.prior_width)]
+    lower = np.array([d.lower for d in skeleton.dofs])
+    upper = np.array([d.upper for d in skeleton.dofs])
+    return FTEProblem(kinematics, fps, np.asarray(frames), tuple(terms), lower, upper)
+
+
+def build_fte(
+    sequence: Sequence, kinematics: Kinematics, options: FTEOptions | None = None
+) -> FTEProblem:
+    """State the trajectory problem of a sequence. Pure: solves nothing, reads and writes nothing.
+
+    Raises
+    ------
+    InputError
+        No detection is above the likelihood threshold.
+    """
+    options = options or FTEOptions()
+    skeleton = kinematics.skeleton
+    pixels = sequence.pixels(skeleton.marker_names, options.likelihood)
+    sd = np.array([m.sd_px for m in skeleton.markers])
+    terms = [
+        measurement_term(camera, pixels[:, c], sd, options.loss, sequence.n_frames)
+        for c, camera in enumerate(sequence.cameras)
+    ]
+    present = [term for term in terms if term is not None]
+    if not present:
+        raise InputError(
+            f"No detection of sequence '{sequence.name}' has a likelihood above {options.likelihood:g}.",
+            key="likelihood",
+            remedy="lower --likelihood, or choose frames in which the animal is seen",
+        )
+    return build_problem(kinematics, sequence.fps, sequence.frames, present, options)

@@ -1,0 +1,280 @@
+"""Solving: the condensed problem through cyipopt, with one set of options and an honest status."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from acino_fte.condensed import Condensed
+from acino_fte.errors import InputError
+from acino_fte.kinematics import Kinematics
+from acino_fte.problem import FTEOptions, FTEProblem
+from acino_fte.result import FTEResult, Status
+from acino_fte.sequence import Sequence
+
+Progress = Callable[[int, float], None]
+
+_STATUS = {  # IPOPT's return codes (IpReturnCodes_inc.h)
+    0: Status.CONVERGED,
+    1: Status.ACCEPTABLE,
+    2: Status.DIVERGED,
+    3: Status.ACCEPTABLE,  # search direction too small: no further progress at this precision
+    4: Status.DIVERGED,
+    5: Status.INTERRUPTED,
+    -1: Status.MAX_ITERATIONS,
+    -2: Status.DIVERGED,
+    -4: Status.MAX_TIME,
+    -5: Status.MAX_TIME,
+}
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """Options of the solver, the same for both lowerings.
+
+    Attributes
+    ----------
+    max_iter : int
+        Most iterations.
+    tolerance : float
+        Converged when no entry of the gradient of the Lagrangian exceeds this (1/rad, 1/m).
+    acceptable_tolerance : float
+        Acceptable when that holds for ten iterations without reaching ``tolerance``.
+    max_seconds : float
+        Most wall-clock time.
+    print_level : int
+        IPOPT's own log, 0 (silent) to 12.
+    linear_solver : str
+        ``mumps``, or another that the installed IPOPT has.
+    hessian : str
+        ``gauss-newton`` or ``exact``.
+    """
+
+    max_iter: int = 500
+    tolerance: float = 1e-3
+    acceptable_tolerance: float = 1.0
+    max_seconds: float = 3600.0
+    print_level: int = 0
+    linear_solver: str = "mumps"
+    hessian: str = "gauss-newton"
+
+    def __post_init__(self) -> None:
+        for name, good in (
+            ("max_iter", self.max_iter >= 0),
+            ("tolerance", self.tolerance > 0),
+            ("max_seconds", self.max_seconds > 0),
+            ("print_level", 0 <= self.print_level <= 12),
+            ("hessian", self.hessian in ("gauss-newton", "exact")),
+        ):
+            if not good:
+                raise InputError(
+                    f"The solver option {name} cannot be {getattr(self, name)!r}.", key=name, remedy="see --help"
+                )
+
+    def ipopt(self) -> dict[str, str | float | int]:
+        """The options in IPOPT's words."""
+        return {
+            "max_iter": self.max_iter,
+            "tol": self.tolerance,
+            "dual_inf_tol": self.tolerance,
+            "acceptable_tol": self.acceptable_tolerance,
+            "acceptable_dual_inf_tol": self.acceptable_tolerance,
+            "acceptable_iter": 10,
+            "max_wall_time": self.max_seconds,
+            "print_level": self.print_level,
+            "sb": "yes",
+            "linear_solver": self.linear_solver,
+            "nlp_scaling_method": "none",
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """The options as plain values for the record."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where a solve ended: status, q (N, Q), objective, iterations."""
+
+    status: Status
+    q: np.ndarray
+    objective: float
+    iterations: int
+
+
+class _Callbacks:
+    """What IPOPT calls: the condensed problem, progress, and the best iterate so far."""
+
+    def __init__(self, condensed: Condensed, progress: Progress | None) -> None:
+        self.condensed = condensed
+        self.progress = progress
+        self.stop = False
+        self.iterations = 0
+        self.best = (np.inf, np.empty(0))
+        self._last: tuple[np.ndarray, float] | None = None
+
+    def objective(self, x: np.ndarray) -> float:
+        """Value, remembered when it is the best so far."""
+        value = self.condensed.objective(x)
+        if value < self.best[0]:
+            self.best = (value, x.copy())
+        return value
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        """∂f/∂x."""
+        return self.condensed.gradient(x)
+
+    def hessianstructure(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the lower triangle."""
+        return self.condensed.structure
+
+    def hessian(self, x: np.ndarray, _multipliers: np.ndarray, factor: float) -> np.ndarray:
+        """Entries of the lower triangle."""
+        return factor * self.condensed.hessian(x)
+
+    def intermediate(self, _mode: int, iteration: int, value: float, *_: float) -> bool:
+        """After each iteration: report, and stop when asked to."""
+        self.iterations = iteration
+        if self.progress is not None:
+            self.progress(iteration, value)
+        return not self.stop
+
+
+def minimise(
+    problem: FTEProblem,
+    start: np.ndarray,
+    options: SolveOptions | None = None,
+    progress: Progress | None = None,
+) -> Minimum:
+    """Minimise a problem from q (N, Q) by its condensed lowering.
+
+    Ctrl-C ends it with the best iterate so far and the status ``interrupted``.
+    """
+    import cyipopt
+
+    options = options or SolveOptions()
+    condensed = Condensed(problem, options.hessian)
+    callbacks = _Callbacks(condensed, progress)
+    n = problem.n_frames
+    start = problem.clip(start, margin=1e-3)
+    solver = cyipopt.Problem(
+        n=start.size,
+        m=0,
+        problem_obj=callbacks,
+        lb=np.tile(np.where(np.isfinite(problem.lower), problem.lower, -1e20), n),
+        ub=np.tile(np.where(np.isfinite(problem.upper), problem.upper, 1e20), n),
+    )
+    for name, value in {**options.ipopt(), **_STRATEGY}.items():
+        solver.add_option(name, value)
+    with _stop_on_interrupt(callbacks):
+        x, info = solver.solve(start.ravel())
+    status = _STATUS.get(info["status"], Status.FAILED)
+    value = float(info["obj_val"])
+    if not status.ok and callbacks.best[0] < np.inf:
+        value, x = callbacks.best
+    return Minimum(status, np.clip(x.reshape(start.shape), problem.lower, problem.upper), value, callbacks.iterations)
+
+
+_STRATEGY: dict[str, str | float | int] = {
+    "mu_strategy": "adaptive",
+    "bound_push": 1e-6,
+    "bound_frac": 1e-6,
+    "mu_init": 1e-4,
+}
+
+
+@contextmanager
+def _stop_on_interrupt(callbacks: _Callbacks) -> Iterator[None]:
+    """Let the first Ctrl-C end the solve in good order instead of tearing through IPOPT."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: object) -> None:
+        callbacks.stop = True
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def solve_fte(
+    problem: FTEProblem,
+    start: np.ndarray,
+    sequence: Sequence,
+    fte_options: FTEOptions | None = None,
+    options: SolveOptions | None = None,
+    *,
+    lowering: str = "condensed",
+    progress: Progress | None = None,
+    seconds: dict[str, float] | None = None,
+) -> FTEResult:
+    """Solve a trajectory problem and put the result together.
+
+    Parameters
+    ----------
+    problem : FTEProblem
+    start : (N, Q)
+    sequence : Sequence
+        The one the problem was built from.
+    fte_options, options
+        Options of the problem (for the record, and for its likelihood threshold) and of the solver.
+    lowering : str
+        ``"condensed"`` or ``"explicit"``.
+    progress : callable, optional
+        Called with (iteration, objective).
+    seconds : dict, optional
+        Time spent so far by stage.
+    """
+    fte_options, options = fte_options or FTEOptions(), options or SolveOptions()
+    began = time.perf_counter()
+    if lowering == "condensed":
+        minimum = minimise(problem, start, options, progress)
+    elif lowering == "explicit":
+        from acino_fte.explicit_solve import minimise_explicit
+
+        minimum = minimise_explicit(problem, start, options, progress)
+    else:
+        raise InputError(f"There is no lowering '{lowering}'.", expected="'condensed' or 'explicit'")
+    spent = {**(seconds or {}), "solve": time.perf_counter() - began}
+    return _result(problem, minimum, sequence, fte_options, options, lowering, spent)
+
+
+def _result(
+    problem: FTEProblem,
+    minimum: Minimum,
+    sequence: Sequence,
+    fte_options: FTEOptions,
+    options: SolveOptions,
+    lowering: str,
+    seconds: dict[str, float],
+) -> FTEResult:
+    kinematics: Kinematics = problem.kinematics
+    positions = kinematics.positions(minimum.q)
+    velocity = np.gradient(minimum.q, problem.dt, axis=0) if problem.n_frames > 1 else 0 * minimum.q
+    acceleration = np.gradient(velocity, problem.dt, axis=0) if problem.n_frames > 1 else 0 * minimum.q
+    return FTEResult(
+        status=minimum.status,
+        sequence=sequence,
+        skeleton=kinematics.skeleton,
+        q=minimum.q,
+        dq=velocity,
+        ddq=acceleration,
+        positions=positions,
+        observed=sequence.pixels(kinematics.skeleton.marker_names, fte_options.likelihood),
+        reprojected=sequence.cameras.project(positions),
+        objective=minimum.objective,
+        iterations=minimum.iterations,
+        method=f"fte-{lowering}",
+        seconds=seconds,
+        options={"problem": fte_options.summary(), "solver": options.summary()},
+    )

@@ -1,0 +1,345 @@
+"""Terms of the trajectory problem: symbolic residuals, and tables of where they apply.
+
+A :class:`Residual` declares a formula once, as SymPy expressions of *handles* (a marker's position, a
+degree of freedom, its velocity or acceleration, now or some frames ago) and of named data. A :class:`Term`
+says for which frames and items it holds, with which data, standard deviation and loss. Both lowerings are
+generic over terms: adding a depth, contact, symmetry or bone-length term is writing one more residual and
+its table here or in a module of one's own; no solver is touched.
+
+The objective is the negative log-posterior Σ ρ(r/σ): with the squared loss, ½(r/σ)².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acino_fte import projection
+from acino_fte.cameras import Camera
+from acino_fte.codegen import Program, ProgramBuilder, cached_programs
+from acino_fte.losses import Loss
+from acino_fte.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    import sympy as sp
+
+_AXES = ("x", "y", "z")
+_STENCIL = {"dof": (1,), "velocity": (1, -1), "acceleration": (1, -2, 1)}
+
+
+@dataclass(frozen=True)
+class Handle:
+    """What a residual depends on.
+
+    Attributes
+    ----------
+    kind : str
+        ``"position"`` (a marker, three numbers, m), ``"dof"`` (q), ``"velocity"`` or ``"acceleration"``
+        (its backward differences in time).
+    lag : int
+        How many frames ago.
+    item : int
+        Which column of the term's ``items`` says which marker or degree of freedom is meant.
+    """
+
+    kind: str
+    lag: int = 0
+    item: int = 0
+
+
+@dataclass(frozen=True)
+class Residual:
+    """A formula r(handles, data), declared once.
+
+    Attributes
+    ----------
+    name : str
+    handles : tuple of Handle
+    data : tuple of str
+        Names of the numbers that each instance brings; ``dt`` (s) is always there.
+    components : tuple of str
+        Names of the residual's components.
+    unit : str
+        Unit of the residual and of its standard deviation.
+    derive : callable
+        ``derive(handles, data) → (components, guards)``: SymPy expressions. ``handles`` has a 3-tuple of
+        symbols for a position and a symbol for the rest. Where a guard is not positive the residual is
+        infinite (a point behind the camera).
+    sources : tuple of Path
+        Files that the formula depends on, for the cache; without them it is derived anew each time.
+    """
+
+    name: str
+    handles: tuple[Handle, ...]
+    data: tuple[str, ...]
+    components: tuple[str, ...]
+    unit: str
+    derive: Callable[[list[Any], dict[str, sp.Symbol]], tuple[list[sp.Expr], list[sp.Expr]]]
+    sources: tuple[Path, ...] = ()
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.handles, self.data))
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """A residual applied K times.
+
+    Attributes
+    ----------
+    family : str
+        ``meas``, ``model``, ``prior``, …: the explicit lowering calls its slack ``slack_<family>``.
+    residual : Residual
+    frames : (K,) int
+        Frame of each instance, counted from the first of the problem.
+    items : (K, I) int
+        Markers or degrees of freedom that the handles refer to.
+    data : dict
+        Each name to a number for all instances or an array (K,).
+    sd : (K,)
+        Standard deviation, in the residual's unit.
+    loss : Loss
+    label : str, optional
+        What the instances have in common beside the family: the camera's name.
+    """
+
+    family: str
+    residual: Residual
+    frames: np.ndarray
+    items: np.ndarray
+    data: Mapping[str, float | np.ndarray]
+    sd: np.ndarray
+    loss: Loss = field(default_factory=lambda: Loss("squared"))
+    label: str = ""
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """A residual in terms of positions and q alone, as programs.
+
+    ``inputs`` lists the local variables in order: (``position`` or ``dof``, lag, item), a position
+    counting three. ``programs`` are ``value`` (components, guards), ``slope`` (components, guards, then
+    ∂component/∂variable) and ``curvature`` (the same, then the second derivatives for variable pairs i ≥ j).
+    """
+
+    inputs: tuple[tuple[str, int, int], ...]
+    n_variables: int
+    linear: bool
+    programs: dict[str, Program]
+
+
+def _symbols(residual: Residual) -> tuple[list[Any], dict[str, sp.Symbol], list[sp.Symbol]]:
+    """Symbols for the handles, by name for the data, and all of them flat in the order of the inputs."""
+    import sympy as sp
+
+    handles: list[Any] = []
+    for i, handle in enumerate(residual.handles):
+        if handle.kind == "position":
+            handles.append(tuple(sp.Symbol(f"h{i}_{a}", real=True) for a in _AXES))
+        else:
+            handles.append(sp.Symbol(f"h{i}", real=True))
+    data = {name: sp.Symbol(name, real=True) for name in ("dt", *residual.data)}
+    flat = [s for h in handles for s in (h if isinstance(h, tuple) else (h,))]
+    return handles, data, flat
+
+
+def residual_program(residual: Residual) -> Program:
+    """The residual as declared: (handles, dt, data) → components. For the explicit lowering."""
+
+    def derive() -> dict[str, Program]:
+        handles, data, flat = _symbols(residual)
+        components, _ = residual.derive(handles, data)
+        return {"declared": ProgramBuilder([*flat, *data.values()]).program(components)}
+
+    return _cached(residual, "declared", derive)["declared"]
+
+
+def _cached(residual: Residual, what: str, derive: Callable[[], dict[str, Program]]) -> dict[str, Program]:
+    if not residual.sources:
+        return derive()
+    sources = (Path(__file__), *residual.sources, residual.handles, residual.data, what)
+    return cached_programs(f"residual-{residual.name}", sources, derive)
+
+
+def input_names(residual: Residual) -> list[str]:
+    """Names of the inputs of :func:`residual_program`, in order."""
+    names: list[str] = []
+    for i, handle in enumerate(residual.handles):
+        names += [f"h{i}_{a}" for a in _AXES] if handle.kind == "position" else [f"h{i}"]
+    return [*names, "dt", *residual.data]
+
+
+@cache
+def lower(residual: Residual) -> Lowered:
+    """Eliminate velocities and accelerations: v_n = (q_n − q_{n−1})/Δt, a_n = (v_n − v_{n−1})/Δt."""
+    inputs = tuple(dict.fromkeys(i for handle in residual.handles for i, _ in _stencil(handle)))
+    programs = _cached(residual, "lowered", lambda: _derive_lowered(residual, inputs))
+    n = sum(3 if kind == "position" else 1 for kind, _, _ in inputs)
+    slopes = programs["slope"].outputs[len(programs["value"].outputs) :]
+    moving = _depends_on(programs["slope"], slopes, {f"y{i}" for i in range(n)})
+    return Lowered(inputs, n, not moving, programs)
+
+
+def _stencil(handle: Handle) -> list[tuple[tuple[str, int, int], int]]:
+    """The variables behind a handle, with their weights (to be divided by Δt, Δt² for derivatives)."""
+    if handle.kind == "position":
+        return [(("position", handle.lag, handle.item), 1)]
+    return [(("dof", handle.lag + k, handle.item), w) for k, w in enumerate(_STENCIL[handle.kind])]
+
+
+def _depends_on(program: Program, outputs: tuple[str, ...], names: set[str]) -> bool:
+    tainted = set(names)
+    for name, text in program.steps:
+        tokens = set("".join(c if c.isalnum() or c == "_" else " " for c in text).split())
+        if tokens & tainted:
+            tainted.add(name)
+    return bool(tainted & set(outputs))
+
+
+def _derive_lowered(residual: Residual, inputs: tuple[tuple[str, int, int], ...]) -> dict[str, Program]:
+    import sympy as sp
+
+    handles, data, _ = _symbols(residual)
+    n = sum(3 if kind == "position" else 1 for kind, _, _ in inputs)
+    y = list(sp.symbols(f"y0:{n}", real=True))
+    place: dict[tuple[str, int, int], list[sp.Symbol]] = {}
+    used = 0
+    for key in inputs:
+        width = 3 if key[0] == "position" else 1
+        place[key] = y[used : used + width]
+        used += width
+    values: list[Any] = []
+    for handle in residual.handles:
+        stencil = _stencil(handle)
+        if handle.kind == "position":
+            values.append(tuple(place[stencil[0][0]]))
+        else:
+            values.append(sum(w * place[key][0] for key, w in stencil) / data["dt"] ** (len(stencil) - 1))
+    components, guards = residual.derive(values, data)
+    first = [sp.diff(c, s) for c in components for s in y]
+    second = [sp.diff(c, y[i], y[j]) for c in components for i in range(n) for j in range(i + 1)]
+    arguments = [*y, *data.values()]
+    base = [*components, *guards]
+    return {
+        "value": ProgramBuilder(arguments).program(base),
+        "slope": ProgramBuilder(arguments).program(base + first),
+        "curvature": ProgramBuilder(arguments).program(base + first + second),
+    }
+
+
+# --- the residuals of the full trajectory estimation -------------------------------------------------
+
+_POSE = tuple(f"r{i}{j}" for i in range(3) for j in range(3)) + ("tx", "ty", "tz")
+
+
+@cache
+def measurement_residual(model: str) -> Residual:
+    """Reprojection residual of a marker, px: π(R·p + t) − (u, v)."""
+
+    def derive(handles: list[Any], data: dict[str, sp.Symbol]) -> tuple[list[sp.Expr], list[sp.Expr]]:
+        (p,) = handles
+        local = [
+            sum(data[f"r{i}{j}"] * p[j] for j in range(3)) + data[f"t{_AXES[i]}"] for i in range(3)
+        ]
+        u, v = projection.project(model, (local[0], local[1], local[2]))
+        return [u - data["u"], v - data["v"]], [local[2]]
+
+    data = ("u", "v", *_POSE, *projection.parameter_names(model))
+    source = (Path(projection.__file__),)
+    return Residual(f"{model}", (Handle("position"),), data, ("u", "v"), "px", derive, source)
+
+
+def _jump(handles: list[Any], _: dict[str, sp.Symbol]) -> tuple[list[sp.Expr], list[sp.Expr]]:
+    now, before = handles
+    return [now - before], []
+
+
+def _from_mean(handles: list[Any], data: dict[str, sp.Symbol]) -> tuple[list[sp.Expr], list[sp.Expr]]:
+    return [handles[0] - data["mean"]], []
+
+
+def _to_point(handles: list[Any], data: dict[str, sp.Symbol]) -> tuple[list[sp.Expr], list[sp.Expr]]:
+    return [handles[0][i] - data[f"p{a}"] for i, a in enumerate(_AXES)], []
+
+
+_HERE = (Path(__file__),)
+JUMP = Residual(
+    "jump", (Handle("acceleration"), Handle("acceleration", 1)), (), ("w",), "m/s² or rad/s²", _jump, _HERE
+)
+PRIOR = Residual("prior", (Handle("dof"),), ("mean",), ("q",), "m or rad", _from_mean, _HERE)
+POINT = Residual("point", (Handle("position"),), ("px", "py", "pz"), _AXES, "m", _to_point, _HERE)
+
+
+def measurement_term(
+    camera: Camera, pixels: np.ndarray, sd_px: np.ndarray, loss: Loss, n_frames: int
+) -> Term | None:
+    """Reprojection of every observed marker in one camera; None when it saw nothing.
+
+    Parameters
+    ----------
+    camera : Camera
+    pixels : (N, M, 2)
+        Detections, px, NaN where missing.
+    sd_px : (M,)
+    loss : Loss
+    n_frames : int
+    """
+    frames, markers = np.nonzero(np.isfinite(pixels).all(-1))
+    if not len(frames):
+        return None
+    data: dict[str, float | np.ndarray] = {
+        "u": pixels[frames, markers, 0],
+        "v": pixels[frames, markers, 1],
+    }
+    rotation, translation = camera.rotation, camera.translation
+    if camera.moves:
+        rotation = np.moveaxis(np.broadcast_to(rotation, (n_frames, 3, 3))[frames], 0, -1)
+        translation = np.moveaxis(np.broadcast_to(translation, (n_frames, 3))[frames], 0, -1)
+    for i in range(3):
+        data[f"t{_AXES[i]}"] = translation[i]
+        data |= {f"r{i}{j}": rotation[i, j] for j in range(3)}
+    names = projection.parameter_names(camera.model)
+    data |= dict(zip(names, camera.parameters.tolist(), strict=True))
+    residual = measurement_residual(camera.model)
+    return Term("meas", residual, frames, markers[:, None], data, sd_px[markers], loss, camera.name)
+
+
+def model_term(skeleton: Skeleton, n_frames: int, fps: float) -> Term:
+    """Constant acceleration plus noise: the jump in acceleration at every frame but the first.
+
+    The noise of the species file holds at ``noise_fps``; acceleration is a random walk, so its jump
+    over one frame grows with the square root of the frame's length.
+    """
+    noise = np.array([d.noise for d in skeleton.dofs]) * np.sqrt(skeleton.noise_fps / fps)
+    frames, dofs = (a.ravel() for a in np.mgrid[1:n_frames, 0 : len(noise)])
+    return Term("model", JUMP, frames, dofs[:, None], {}, noise[dofs])
+
+
+def prior_term(skeleton: Skeleton, n_frames: int, width: float) -> Term:
+    """A weak pull of each limited joint to the middle of its range; σ is ``width`` times half the range.
+
+    It decides what no camera observes (a marker that is never seen), and hardly touches the rest.
+    """
+    limited = [j for j, d in enumerate(skeleton.dofs) if np.isfinite(d.lower + d.upper)]
+    frames, which = (a.ravel() for a in np.mgrid[0:n_frames, 0 : len(limited)])
+    dofs = np.array(limited, dtype=int)[which]
+    mean = np.array([d.middle for d in skeleton.dofs])[dofs]
+    half = np.array([0.5 * (d.upper - d.lower) for d in skeleton.dofs])[dofs]
+    return Term("prior", PRIOR, frames, dofs[:, None], {"mean": mean}, width * half)
+
+
+def point_term(points: np.ndarray, sd: float | np.ndarray, loss: Loss) -> Term:
+    """Distance of markers to given points (N, M, 3), m, NaN where unknown: inverse kinematics."""
+    frames, markers = np.nonzero(np.isfinite(points).all(-1))
+    at = points[frames, markers]
+    data = {"px": at[:, 0], "py": at[:, 1], "pz": at[:, 2]}
+    sigma = np.broadcast_to(sd, points.shape[:2])[frames, markers]
+    return Term("point", POINT, frames, markers[:, None], data, sigma, loss)
