@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 from acino_fte.errors import InputError, did_you_mean
-from acino_fte.species_file import AXES, LinkEntry, MarkerEntry, SpeciesFile, read_species_file
+from acino_fte.species_faults import plain_name, structure_faults
+from acino_fte.species_file import AXES, DofEntry, SpeciesFile, raise_first, read_species_file
+from acino_fte.species_mirror import Mirrored, mirror_species, turns_over
 
 _LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 DEFAULT_NOISE = {"turn": math.radians(4000.0), "slide": 5.0}
@@ -83,7 +84,20 @@ class Marker:
 class Skeleton:
     """A species, expanded: mirrored twins made, names resolved, metres and radians.
 
-    ``links`` are ordered parents first; ``dofs`` are in the order of the state vector q.
+    Attributes
+    ----------
+    links : tuple of Link
+        Parents first.
+    dofs : tuple of Dof
+        In the order of the state vector q.
+    edges : tuple of (int, int)
+        Marker pairs to draw a line between.
+    capsules : tuple of (int, int, float)
+        Solid body: marker pairs and the radius (m) of the capsule between them.
+    twins : tuple of (str, str)
+        Markers and their mirrored twins: left, right.
+    noise_fps : float
+        Frame rate (Hz) that the process noise of the DOF is stated at.
     """
 
     name: str
@@ -125,9 +139,8 @@ class Skeleton:
 
     def match_keypoints(self, names: Iterable[str]) -> dict[str, str]:
         """Map keypoint names of a file to marker names, by name or alias, case and punctuation ignored."""
-        known = {_plain(alias): m.name for m in self.markers for alias in m.aliases}
-        known |= {_plain(m.name): m.name for m in self.markers}
-        return {name: known[_plain(name)] for name in names if _plain(name) in known}
+        known = {plain_name(alias): m.name for m in self.markers for alias in (m.name, *m.aliases)}
+        return {name: known[plain_name(name)] for name in names if plain_name(name) in known}
 
     @cached_property
     def content_hash(self) -> str:
@@ -138,10 +151,6 @@ class Skeleton:
         ]
         markers = [(m.link, m.at) for m in self.markers]
         return sha256(repr((parts, markers, len(self.dofs))).encode()).hexdigest()[:24]
-
-
-def _plain(name: str) -> str:
-    return "".join(c for c in name.lower() if c.isalnum())
 
 
 def _index(names: list[str], name: str, what: str, species: str) -> int:
@@ -162,71 +171,64 @@ def load_skeleton(species: str | Path) -> Skeleton:
     InputError
         No such species, or the file has a fault.
     """
-    from acino_fte import models
-
-    path = Path(species)
-    if path.suffix not in (".yaml", ".yml") and not path.is_file():
-        names = models.species_names()
-        if str(species) not in names:
-            raise InputError(
-                f"There is no species '{species}'{did_you_mean(str(species), names)}",
-                expected=f"one of {', '.join(names)}, or the path of a species file (.yaml)",
-                remedy="'acino-fte skeleton list' shows the species, 'acino-fte skeleton new' starts your own",
-            )
-        path = models.species_path(str(species))
+    path = species_file_path(species)
     return expand(read_species_file(path), path)
 
 
+def species_file_path(species: str | Path) -> Path:
+    """Path of a species file: of a bundled species by its name, else the path given.
+
+    Raises
+    ------
+    InputError
+        It is neither the name of a bundled species nor a file.
+    """
+    from acino_fte import models
+
+    path, names = Path(species), models.species_names()
+    if str(species) in names:
+        return models.species_path(str(species))
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return path
+    raise InputError(
+        f"There is no species '{species}'{did_you_mean(str(species), names)}",
+        expected=f"one of {', '.join(names)}, or the path of a species file (.yaml)",
+        remedy="'acino-fte skeleton list' shows the species, 'acino-fte skeleton new' starts your own",
+    )
+
+
 def expand(species: SpeciesFile, path: Path | None = None) -> Skeleton:
-    """Turn a species file into a :class:`Skeleton`: twins, indices, metres, radians."""
-    links = _mirror_links(species.links, path)
-    markers = _mirror_markers(species, path)
-    order = _parents_first({name: entry.parent for name, (entry, _) in links.items()}, path)
+    """Turn a species file into a :class:`Skeleton`: twins, indices, metres, radians.
+
+    Raises
+    ------
+    InputError
+        The file follows the schema but contradicts itself (unknown names, loops, clashes).
+    """
+    whole = mirror_species(species)
+    raise_first(structure_faults(species, whole), path)
     scale = _LENGTH[species.units.length]
-    dofs = _expand_dofs(species, links)
-    state = _state_order(species, list(dofs), path)
-    place = {name: i for i, name in enumerate(state)}
-    link_index = {name: i for i, name in enumerate(order)}
-    built_links = [
-        Link(
-            name,
-            link_index.get(links[name][0].parent, -1),
-            _vector(links[name][0].at, scale),
-            tuple(place[f"{name}.{d}"] for d in links[name][0].dofs),
-        )
-        for name in order
-    ]
-    built_markers = []
-    for name, (entry, _) in markers.items():
-        if entry.link not in link_index:
-            raise InputError(
-                f"Marker '{name}' sits on link '{entry.link}', which is not declared"
-                f"{did_you_mean(entry.link, link_index)}",
-                file=path,
-                key=f"markers.{name}.link",
-                expected=f"one of {', '.join(link_index)}",
-                remedy="mend the name, or declare the link",
-            )
-        built_markers.append(
-            Marker(name, link_index[entry.link], _vector(entry.at, scale), entry.sd_px, tuple(entry.aliases))
-        )
-    marker_index = {m.name: i for i, m in enumerate(built_markers)}
-    twin = {e.mirror: n for n, (e, made) in markers.items() if e.mirror and not made}
-    twins = tuple((original, right) for right, original in twin.items())
-    edges = _pairs([(e, f"draw[{i}]") for i, e in enumerate(species.draw)], marker_index, dict(twins), path)
-    capsules: list[tuple[int, int, float]] = []
-    for i, body in enumerate(species.body):
-        pairs = _pairs([(body.between, f"body[{i}].between")], marker_index, dict(twins), path)
-        capsules += [(a, b, body.radius * scale) for a, b in pairs]
-    _check_aliases(built_markers, path)
+    dofs = _expand_dofs(species, whole)
+    state = species.order or list(dofs)
+    links = _expand_links(whole, {name: i for i, name in enumerate(state)}, scale)
+    link_index = {link.name: i for i, link in enumerate(links)}
+    markers = tuple(
+        Marker(name, link_index[entry.link], _vector(entry.at, scale), entry.sd_px, tuple(entry.aliases))
+        for name, entry in whole.markers.items()
+    )
+    marker_index = {m.name: i for i, m in enumerate(markers)}
+    capsules: dict[tuple[int, int], float] = {}
+    for body in species.body:
+        for pair in _with_mirror_images([body.between], marker_index, whole.marker_twins):
+            capsules[pair] = body.radius * scale
     return Skeleton(
         name=species.name,
-        links=tuple(built_links),
+        links=links,
         dofs=tuple(dofs[name] for name in state),
-        markers=tuple(built_markers),
-        edges=tuple(edges),
-        capsules=tuple(capsules),
-        twins=twins,
+        markers=markers,
+        edges=_with_mirror_images(species.draw, marker_index, whole.marker_twins),
+        capsules=tuple((a, b, radius) for (a, b), radius in capsules.items()),
+        twins=tuple(whole.marker_twins.items()),
         noise_fps=species.noise_fps,
         source=species.source,
         path=path,
@@ -237,158 +239,55 @@ def _vector(values: list[float], scale: float) -> tuple[float, float, float]:
     return values[0] * scale, values[1] * scale, values[2] * scale
 
 
-def _with_twins(entries: dict, what: str, path: Path | None, twin_of: Callable) -> dict[str, tuple[Any, bool]]:
-    """Add the right-hand twins, each after its original; the flag says which were made."""
-    result: dict[str, tuple[Any, bool]] = {}
-    for name, entry in entries.items():
-        result[name] = (entry, False)
-        if entry.mirror is None:
-            continue
-        if entry.mirror in result or entry.mirror in entries:
-            raise InputError(
-                f"Two {what}s would be called '{entry.mirror}' after mirroring.",
-                file=path,
-                key=f"{what}s.{name}.mirror",
-                remedy=f"declare '{entry.mirror}' once: as the mirror of '{name}', or by hand",
-            )
-        result[entry.mirror] = (twin_of(entry), True)
-    return result
-
-
-def _mirror_links(entries: dict[str, LinkEntry], path: Path | None) -> dict[str, tuple[LinkEntry, bool]]:
-    twins = {name: entry.mirror for name, entry in entries.items() if entry.mirror}
-
-    def twin_of(entry: LinkEntry) -> LinkEntry:
-        parent = twins.get(entry.parent, entry.parent)
-        return entry.model_copy(update={"at": _across(entry.at), "parent": parent})
-
-    return _with_twins(entries, "link", path, twin_of)
-
-
-def _mirror_markers(species: SpeciesFile, path: Path | None) -> dict[str, tuple[MarkerEntry, bool]]:
-    twins = {name: entry.mirror for name, entry in species.links.items() if entry.mirror}
-
-    def twin_of(entry: MarkerEntry) -> MarkerEntry:
-        update = {
-            "at": _across(entry.at),
-            "link": twins.get(entry.link, entry.link),
-            "aliases": entry.mirror_aliases,
-            "sd_px": entry.mirror_sd_px or entry.sd_px,
-        }
-        return entry.model_copy(update=update)
-
-    return _with_twins(species.markers, "marker", path, twin_of)
-
-
-def _across(at: list[float]) -> list[float]:
-    """Reflect a position in the animal's plane of symmetry (y = 0)."""
-    return [at[0], -at[1] if at[1] else 0.0, at[2]]
-
-
-def _parents_first(parents: dict[str, str], path: Path | None) -> list[str]:
-    """Order links so that parents come first; report unknown parents and loops."""
-    for name, parent in parents.items():
-        if parent != "world" and parent not in parents:
-            raise InputError(
-                f"Link '{name}' hangs on '{parent}', which is not declared{did_you_mean(parent, parents)}",
-                file=path,
-                key=f"links.{name}.parent",
-                expected=f"'world' or one of {', '.join(parents)}",
-                remedy="mend the name, or declare the link",
-            )
+def _expand_links(whole: Mirrored, place: Mapping[str, int], scale: float) -> tuple[Link, ...]:
+    """Links, parents first, otherwise in the order of the file."""
+    parents = {name: entry.parent for name, entry in whole.links.items()}
     order: list[str] = []
-    done = {"world"}
     while len(order) < len(parents):
-        ready = [n for n, p in parents.items() if n not in done and p in done]
-        if not ready:
-            loop = [n for n in parents if n not in done]
-            raise InputError(
-                "The links form a loop: none of them leads to the world.",
-                file=path,
-                key="links." + loop[0],
-                found=" <- ".join(loop),
-                remedy="give one of them 'parent: world'",
-            )
-        order += ready[:1]
-        done.add(ready[0])
-    return order
-
-
-def _expand_dofs(species: SpeciesFile, links: dict) -> dict[str, Dof]:
-    """Degrees of freedom by name; a twin turns the other way about x and z and slides the other way in y."""
-    angle = math.pi / 180.0 if species.units.angle == "deg" else 1.0
-    length = _LENGTH[species.units.length]
-    dofs = {}
-    for link, (entry, made) in links.items():
-        for name, dof in entry.dofs.items():
-            kind = "turn" if dof.turn else "slide"
-            scale = angle if kind == "turn" else length
-            flip = made and ((kind == "turn") == (dof.axis in "xz"))
-            axis = [0.0, 0.0, 0.0]
-            axis[AXES.index(dof.axis)] = -1.0 if flip else 1.0
-            lower, upper = dof.range or (-math.inf, math.inf)
-            noise = dof.noise * scale if dof.noise else DEFAULT_NOISE[kind]
-            dofs[f"{link}.{name}"] = Dof(
-                f"{link}.{name}", kind, (axis[0], axis[1], axis[2]), lower * scale, upper * scale, noise
-            )
-    return dofs
-
-
-def _state_order(species: SpeciesFile, names: list[str], path: Path | None) -> list[str]:
-    if species.order is None:
-        return names
-    for name in species.order:
-        if name not in names:
-            raise InputError(
-                f"The state order names '{name}', which is no degree of freedom{did_you_mean(name, names)}",
-                file=path,
-                key="order",
-                remedy="use link.dof, as 'acino-fte skeleton show' prints them",
-            )
-    if sorted(species.order) != sorted(names):
-        missing = [n for n in names if n not in species.order]
-        raise InputError(
-            "The state order must name every degree of freedom once.",
-            file=path,
-            key="order",
-            found=f"missing {', '.join(missing)}" if missing else "a name given twice",
-            remedy="complete the list, or leave 'order' out",
+        order.append(next(n for n, p in parents.items() if n not in order and p in ("world", *order)))
+    return tuple(
+        Link(
+            name,
+            order.index(parents[name]) if parents[name] != "world" else -1,
+            _vector(whole.links[name].at, scale),
+            tuple(place[f"{name}.{dof}"] for dof in whole.links[name].dofs),
         )
-    return list(species.order)
+        for name in order
+    )
 
 
-def _pairs(
-    pairs: list[tuple[list[str], str]], index: dict[str, int], twins: dict[str, str], path: Path | None
-) -> list[tuple[int, int]]:
-    """Marker pairs as indices, with the mirror image of each pair that has one."""
+def _expand_dofs(species: SpeciesFile, whole: Mirrored) -> dict[str, Dof]:
+    """Degrees of freedom by name, in the order of the file."""
+    scales = {
+        "turn": math.pi / 180.0 if species.units.angle == "deg" else 1.0,
+        "slide": _LENGTH[species.units.length],
+    }
+    return {
+        f"{link}.{name}": _expand_dof(f"{link}.{name}", dof, scales, whole.is_made(link) and turns_over(dof))
+        for link, entry in whole.links.items()
+        for name, dof in entry.dofs.items()
+    }
+
+
+def _expand_dof(name: str, entry: DofEntry, scales: Mapping[str, float], flip: bool) -> Dof:
+    kind = "turn" if entry.turn else "slide"
+    scale = scales[kind]
+    axis = [0.0, 0.0, 0.0]
+    axis[AXES.index(entry.axis)] = -1.0 if flip else 1.0
+    lower, upper = entry.range or (-math.inf, math.inf)
+    noise = entry.noise * scale if entry.noise else DEFAULT_NOISE[kind]
+    return Dof(name, kind, (axis[0], axis[1], axis[2]), lower * scale, upper * scale, noise)
+
+
+def _with_mirror_images(
+    pairs: list[list[str]], index: Mapping[str, int], twins: Mapping[str, str]
+) -> tuple[tuple[int, int], ...]:
+    """Marker pairs as indices, each followed by its mirror image where it has one; none twice."""
     result: list[tuple[int, int]] = []
-    for pair, key in pairs:
-        for name in pair:
-            if name not in index:
-                raise InputError(
-                    f"'{name}' is no marker{did_you_mean(name, index)}",
-                    file=path,
-                    key=key,
-                    expected=f"one of {', '.join(index)}",
-                    remedy="mend the name, or declare the marker",
-                )
-        for names in (pair, [twins.get(n, n) for n in pair]):
-            edge = (index[names[0]], index[names[1]])
+    image = {**twins, **{right: left for left, right in twins.items()}}
+    for pair in pairs:
+        for a, b in (pair, [image.get(name, name) for name in pair]):
+            edge = (index[a], index[b])
             if edge not in result and edge[::-1] not in result:
                 result.append(edge)
-    return result
-
-
-def _check_aliases(markers: list[Marker], path: Path | None) -> None:
-    """One keypoint name must never mean two markers."""
-    owner: dict[str, str] = {}
-    for marker in markers:
-        for alias in (marker.name, *marker.aliases):
-            other = owner.setdefault(_plain(alias), marker.name)
-            if other != marker.name:
-                raise InputError(
-                    f"The name '{alias}' means both marker '{other}' and marker '{marker.name}'.",
-                    file=path,
-                    key=f"markers.{marker.name}.aliases",
-                    remedy="remove it from one of them",
-                )
+    return tuple(result)

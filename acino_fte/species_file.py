@@ -6,8 +6,10 @@ A species file declares links, degrees of freedom and markers. It is validated h
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -16,10 +18,11 @@ from acino_fte.errors import InputError, did_you_mean
 
 FORMAT = "acino-fte/skeleton/1"
 AXES = ("x", "y", "z")
+NAME_PATTERN = r"^[A-Za-z][A-Za-z0-9_]*$"
 
 Axis = Literal["x", "y", "z"]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 
 
 class _Strict(BaseModel):
@@ -45,8 +48,9 @@ class DofEntry(_Strict):
         None,
         gt=0,
         description="process noise: standard deviation of the jump in acceleration from one frame to the "
-        "next at noise_fps, in length/s² or angle/s²",
+        "next at noise_fps, in length/s² or angle/s²; 5 m/s² or 4000 deg/s² when left out",
     )
+    mirror_noise: float | None = Field(None, gt=0, description="noise of the twin when it differs")
 
     @model_validator(mode="after")
     def _one_motion(self) -> DofEntry:
@@ -120,19 +124,28 @@ class _UniqueKeyLoader(yaml.SafeLoader):
     """Safe loader that refuses a key given twice instead of keeping the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
+        seen: set[str] = set()
         for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if key in seen:
+            if not isinstance(key_node, yaml.ScalarNode):
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"key '{key}' is given twice", key_node.start_mark
+                    None, None, "a key must be a plain word", key_node.start_mark
                 )
-            seen.add(key)
+            if key_node.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key '{key_node.value}' is given twice", key_node.start_mark
+                )
+            seen.add(key_node.value)
         return super().construct_mapping(node, deep)
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a YAML file with the safe loader; duplicate keys are refused."""
+    """Read a YAML file with the safe loader; duplicate keys are refused.
+
+    Raises
+    ------
+    InputError
+        The file is missing, unreadable, or not YAML.
+    """
     try:
         loader = _UniqueKeyLoader(path.read_text(encoding="utf-8"))
         return loader.get_single_data()
@@ -140,36 +153,87 @@ def read_yaml(path: Path) -> Any:
         raise InputError("The file does not exist.", file=path, remedy="check the path") from None
     except IsADirectoryError:
         raise InputError("A file is wanted, this is a folder.", file=path) from None
+    except OSError as error:
+        raise InputError("The file cannot be read.", file=path, found=error.strerror) from None
     except UnicodeDecodeError:
         raise InputError(
             "The file is not text.", file=path, expected="YAML in UTF-8", remedy="check the path"
         ) from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else None
         raise InputError(
             "The file is not valid YAML.",
             file=path,
             key=where,
-            found=getattr(error, "problem", None) or str(error),
+            found=getattr(error, "problem", None) or str(error).split("\n")[0],
             remedy="mend that line (indentation with spaces, a colon after each key)",
         ) from None
 
 
+@dataclass(frozen=True)
+class Fault:
+    """One thing that is wrong in a file; the fields are those of :class:`~acino_fte.errors.InputError`."""
+
+    key: str
+    problem: str
+    expected: str | None = None
+    found: str | None = None
+    remedy: str | None = None
+
+
+def raise_first(faults: list[Fault], path: Path | None) -> None:
+    """Raise the first of the faults, if any, as an InputError that says how many more there are."""
+    if not faults:
+        return
+    first, more = faults[0], len(faults) - 1
+    remedy = first.remedy
+    if more:
+        hint = f"'acino-fte skeleton check {path}' lists this fault and {more} more"
+        remedy = f"{remedy}; {hint}" if remedy else hint
+    raise InputError(
+        first.problem, file=path, key=first.key, expected=first.expected, found=first.found, remedy=remedy
+    )
+
+
+def validation_faults(error: ValidationError, model: type[BaseModel]) -> list[tuple[str, str]]:
+    """Place and description of every validation error, with suggestions for misspelt keys."""
+    return [
+        (".".join(str(part) for part in item["loc"] if part != "[key]"), _description(dict(item), model))
+        for item in error.errors()
+    ]
+
+
 def validation_message(error: ValidationError, model: type[BaseModel]) -> tuple[str, str]:
     """The place and the fault of the first validation error, with a suggestion for a misspelt key."""
-    first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"])
-    text = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "extra_forbidden":
-        known = _known_keys(model, first["loc"][:-1])
-        text = f"unknown key '{first['loc'][-1]}'{did_you_mean(str(first['loc'][-1]), known)}"
-        if known:
-            text += f" (known: {', '.join(known)})"
-    elif first["type"] == "missing":
-        text = "this key is missing"
-    more = len(error.errors()) - 1
-    return place, text + (f" (and {more} more faults)" if more else "")
+    (place, text), *others = validation_faults(error, model)
+    return place, text + (f" (and {len(others)} more faults)" if others else "")
+
+
+def _description(item: dict[str, Any], model: type[BaseModel]) -> str:
+    """One validation error in words a biologist can act on."""
+    name = str(item["loc"][-1]) if item["loc"] else ""
+    if item["type"] == "extra_forbidden":
+        known = _known_keys(model, item["loc"][:-1])
+        listed = f" (known: {', '.join(known)})" if known else ""
+        return f"unknown key '{name}'{did_you_mean(name, known)}{listed}"
+    if item["type"] == "missing":
+        return "this key is missing"
+    if item["type"] == "string_pattern_mismatch":
+        return f"'{item['input']}' is no name: begin with a letter, then only letters, digits and _"
+    if name == "[key]":
+        return (
+            f"the name reads as {item['input']!r}, not as text; put it in quotes (YAML takes on, off, "
+            "yes, no and numbers for something else)"
+        )
+    if item["type"] == "value_error":
+        return item["msg"].removeprefix("Value error, ")
+    return f"{item['msg'][:1].lower()}{item['msg'][1:]}, found {_short(item['input'])}"
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
@@ -178,27 +242,19 @@ def _known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]
     for part in loc:
         if isinstance(current, type) and issubclass(current, BaseModel):
             field = current.model_fields.get(str(part))
-            current = field.annotation if field else None
-        else:  # the annotation of a dict, a list or an optional: step into its arguments
-            current = _nested_model(current)
-        if not (isinstance(current, type) and issubclass(current, BaseModel)):
-            nested = _nested_model(current)
-            if nested is not None and "dict" not in str(current) and "list" not in str(current):
-                current = nested
+            current = _bare(field.annotation) if field else None
+        else:  # a dict or a list: step into what it holds
+            current = _bare((get_args(current) or (None,))[-1])
     if isinstance(current, type) and issubclass(current, BaseModel):
         return list(current.model_fields)
     return []
 
 
-def _nested_model(annotation: Any) -> Any:
-    """The pydantic model inside an annotation such as ``dict[Name, LinkEntry]``."""
-    for argument in getattr(annotation, "__args__", ()):
-        if isinstance(argument, type) and issubclass(argument, BaseModel):
-            return argument
-        nested = _nested_model(argument)
-        if nested is not None:
-            return nested
-    return None
+def _bare(annotation: Any) -> Any:
+    """An annotation without its Annotated and Optional wrapping."""
+    while get_origin(annotation) in (Annotated, Union, UnionType):
+        annotation = next(a for a in get_args(annotation) if a is not NoneType)
+    return annotation
 
 
 def read_species_file(path: Path) -> SpeciesFile:
@@ -209,13 +265,23 @@ def read_species_file(path: Path) -> SpeciesFile:
     InputError
         The file is missing, is not YAML, or does not follow the schema.
     """
+    data = read_species_mapping(path)
+    try:
+        return SpeciesFile.model_validate(data)
+    except ValidationError as error:
+        raise_first(schema_faults(error), path)
+        raise  # never reached: a validation error has at least one fault
+
+
+def read_species_mapping(path: Path) -> dict[str, Any]:
+    """Read a species file as plain data; only its format line is checked."""
     data = read_yaml(path)
     if not isinstance(data, dict):
         raise InputError(
             "The species file holds no mapping.",
             file=path,
             expected=f"'format: {FORMAT}', then 'name', 'links' and 'markers'",
-            found=type(data).__name__,
+            found="nothing" if data is None else type(data).__name__,
             remedy="start from 'acino-fte skeleton new NAME'",
         )
     if data.get("format") != FORMAT:
@@ -227,20 +293,19 @@ def read_species_file(path: Path) -> SpeciesFile:
             found=repr(data.get("format")),
             remedy=f"write 'format: {FORMAT}' as its first line",
         )
-    try:
-        return SpeciesFile.model_validate(data)
-    except ValidationError as error:
-        place, text = validation_message(error, SpeciesFile)
-        raise InputError(
-            f"The species file has a fault at '{place}': {text}.",
-            file=path,
-            key=place,
-            remedy="mend that key; 'acino-fte skeleton schema' prints what is allowed",
-        ) from None
+    return data
+
+
+def schema_faults(error: ValidationError) -> list[Fault]:
+    """Every place where a species file departs from the schema."""
+    remedy = "mend that key; 'acino-fte skeleton schema' prints what is allowed"
+    return [
+        Fault(place, f"The species file has a fault at '{place}': {text}.", remedy=remedy)
+        for place, text in validation_faults(error, SpeciesFile)
+    ]
 
 
 def json_schema() -> dict[str, Any]:
     """JSON Schema of a species file, for completion and checks in an editor."""
     schema = SpeciesFile.model_json_schema()
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    return schema
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
