@@ -1,0 +1,63 @@
+"""The figures of a run, each as PNG and as vector PDF.
+
+Drawn through matplotlib's object interface on the Agg and PDF canvases: no window, no global state of pyplot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib
+
+from acino_fte.plots_histograms import camera_figure, error_figure, marker_figure
+from acino_fte.plots_joints import joint_figure, motion_figure
+from acino_fte.plots_style import STYLE
+from acino_fte.plots_trajectory import trajectory_figure
+from acino_fte.plots_views import view_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from acino_fte.result import FTEResult
+
+DPI = 150
+
+FIGURES: dict[str, tuple[str, Callable[[FTEResult], Figure]]] = {
+    "trajectory": ("Trajectory as stick figures", trajectory_figure),
+    "reprojection_error": ("Reprojection error", error_figure),
+    "reprojection_by_camera": ("Reprojection error by camera", camera_figure),
+    "reprojection_by_marker": ("Reprojection error by marker", marker_figure),
+    "joint_angles": ("Joint angles and their limits", joint_figure),
+    "body_motion": ("Motion of the body", motion_figure),
+    "camera_views": ("The skeleton in the cameras", view_figure),
+}
+"""File name → what it shows, and the function that draws it."""
+
+
+def save_figures(result: FTEResult, folder: Path | str) -> list[Path]:
+    """Draw every figure of a result into a folder, which is made if need be.
+
+    Parameters
+    ----------
+    result : FTEResult
+        An unconverged result gets the same figures, marked in red.
+    folder : Path
+        For ``NAME.png`` (150 dots per inch) and ``NAME.pdf``, names as in :data:`FIGURES`.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    with matplotlib.rc_context(dict(matplotlib.rcParamsDefault) | STYLE):
+        for name, (_, draw) in FIGURES.items():
+            figure = draw(result)
+            written += [folder / f"{name}.png", folder / f"{name}.pdf"]
+            figure.savefig(written[-2], dpi=DPI, metadata={"Software": None})
+            figure.savefig(written[-1], metadata={"CreationDate": None, "Producer": None})
+    return written
