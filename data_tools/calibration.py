@@ -18,8 +18,6 @@ FORMAT = "acino-fte/cameras/1"
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _KINDS = f"'format: {FORMAT}', an AcinoSet scene (camera_resolution, cameras), or TOML as Anipose writes it"
 
-Matrix = list[list[float]]
-
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -31,10 +29,10 @@ class CameraEntry(_Strict):
     name: str = Field(min_length=1)
     model: Literal["pinhole", "fisheye"]
     resolution: tuple[int, int] = Field(description="width and height, px")
-    matrix: Matrix = Field(description="3×3 camera matrix, px")
-    distortion: list[float] = Field(description="OpenCV's coefficients in OpenCV's order")
-    rotation: Matrix | list[Matrix] = Field(description="world to camera, 3×3 or one 3×3 per frame")
-    translation: list[float] | Matrix = Field(description="world to camera, m, 3 or 3 per frame")
+    matrix: list = Field(description="3×3 camera matrix, px")
+    distortion: list = Field(description="OpenCV's coefficients in OpenCV's order")
+    rotation: list = Field(description="world to camera, 3×3 or one 3×3 per frame")
+    translation: list = Field(description="world to camera, m, 3 or 3 per frame")
 
 
 class CamerasFile(_Strict):
@@ -75,6 +73,7 @@ def read_cameras(path: Path | str, *, unit: str = "m") -> CameraArray:
     Parameters
     ----------
     path : Path
+        The file; its ending .toml or another says which of them.
     unit : {"m", "cm", "mm"}
         Unit of the translations in the file. Anipose's is that of the calibration board, often mm.
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from acino_fte.data_tools.keypoints import Keypoints
 
 from acino_fte.cameras import CameraArray
-from acino_fte.data_tools.keypoints import Keypoints
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:
@@ -73,6 +74,16 @@ def check_poses(cameras: CameraArray, n_frames: int, path: str) -> None:
                     found=f"{len(value)}",
                     remedy="write a pose for every frame, or a single one for a fixed camera",
                 )
+
+
+def same_pose_warnings(cameras: CameraArray) -> list[str]:
+    """Warn of fixed cameras with one and the same pose: an entry of the calibration was copied."""
+    return [
+        f"Cameras '{a.name}' and '{b.name}' have the very same position and orientation: one of them may be "
+        "a copy of the other in the camera file."
+        for a, b in combinations((camera for camera in cameras if not camera.moves), 2)
+        if np.array_equal(a.rotation, b.rotation) and np.array_equal(a.translation, b.translation)
+    ]
 
 
 def check_detections(

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from acino_fte.data_tools.keypoints import COORDINATES, Keypoints, from_table
+
 from acino_fte.errors import InputError
 
 H5_SUFFIXES = (".h5", ".hdf5", ".hdf")
@@ -169,7 +169,7 @@ def _numbers(
             file=path,
             key=f"line {body[row][0]}, {where}",
             expected="a number",
-            found=repr(str(cells.iat[row, column])),
+            found=repr(str(cells.iloc[row, column])),
             remedy=remedy,
         ) from None
     return table[:, 1:], table[:, 0]
@@ -189,6 +189,7 @@ def write_deeplabcut_csv(
     Parameters
     ----------
     path : Path
+        The CSV to write.
     names : sequence of str
         The K body parts.
     position : (N, K, 2)

@@ -12,7 +12,7 @@ from acino_fte.errors import InputError
 
 COORDINATES = ("x", "y", "likelihood")
 _MAX_LIKELIHOOD = 2.0  # heat maps overshoot 1 a little; percentages overshoot it a lot
-_MAX_GAP = 1_000_000
+_MAX_GAP = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +65,7 @@ def from_table(
     columns : sequence of (bodypart, coordinate)
         One pair per column of `values`.
     values : (R, K * 3)
+        Numbers of the table; NaN where a cell is empty.
     index : (R,)
         Frame number of each row, counted from the start of the recording.
     path : Path
@@ -117,7 +118,7 @@ def _check_columns(columns: Sequence[tuple[str, str]], names: tuple[str, ...], p
             found=", ".join(coordinates),
             remedy="give the 2D files of the single cameras"
             if spatial
-            else "give the table that analyze_videos wrote, or add a likelihood column with 1 for every label",
+            else "give the table that analyze_videos wrote, or add likelihood columns with 1 in them",
         )
     seen: set[tuple[str, str]] = set()
     for column in columns:

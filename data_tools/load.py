@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-
-from acino_fte.cameras import CameraArray
 from acino_fte.data_tools import checks
 from acino_fte.data_tools.acinoset import is_acinoset, understand_acinoset
 from acino_fte.data_tools.calibration import read_cameras
@@ -17,6 +15,8 @@ from acino_fte.data_tools.matching import match_markers, match_warnings
 from acino_fte.data_tools.pairing import check_pairing
 from acino_fte.data_tools.sequence_file import FILE_NAME, SequenceFile, read_sequence_file
 from acino_fte.data_tools.truth import read_truth
+
+from acino_fte.cameras import CameraArray
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton, load_skeleton
@@ -70,9 +70,11 @@ def load_sequence(
     checks.check_poses(cameras, n_frames, file.cameras)
     paths = list(file.keypoints.values())
     warnings += checks.check_detections(detections, cameras, paths, likelihood)
+    warnings += checks.same_pose_warnings(cameras)
     warnings += check_pairing(detections, cameras, likelihood)
     truth = read_truth(file.truth, skeleton, n_frames) if file.truth else None
-    name = file.name or Path(path).resolve().name
+    folder = source.parent if source.is_file() else source
+    name = file.name or folder.resolve().name
     sequence = Sequence(
         name=name,
         species=str(file.species),

@@ -55,6 +55,7 @@ def match_warnings(
     matches : mapping
         Marker by keypoint name, for each camera.
     skeleton : Skeleton
+        The species.
     """
     found = {marker for match in matches.values() for marker in match.values()}
     free = [m for m in skeleton.marker_names if m not in found]

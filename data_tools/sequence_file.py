@@ -20,7 +20,7 @@ class SequenceFile(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    format: Literal["acino-fte/sequence/1"] = FORMAT
+    format: Literal["acino-fte/sequence/1"] = "acino-fte/sequence/1"
     name: str | None = Field(None, description="name of the recording; by default that of its folder")
     species: str | None = Field(None, description="a species, or the path of a species file (.yaml)")
     fps: float | None = Field(None, gt=0, description="frames per second")
@@ -35,6 +35,16 @@ class SequenceFile(BaseModel):
     def _text_keys(cls, value: Any) -> Any:
         """YAML reads a camera called 1 as a number."""
         return {str(k): v for k, v in value.items()} if isinstance(value, dict) else value
+
+    @field_validator("keypoints")
+    @classmethod
+    def _one_file_each(cls, value: dict[str, str]) -> dict[str, str]:
+        owner: dict[str, str] = {}
+        for camera, path in value.items():
+            if path in owner:
+                raise ValueError(f"cameras '{owner[path]}' and '{camera}' are given the same file '{path}'")
+            owner[path] = camera
+        return value
 
     @field_validator("frames")
     @classmethod
@@ -109,6 +119,11 @@ def write_sequence_file(path: Path | str, content: SequenceFile | dict[str, Any]
         file = content if isinstance(content, SequenceFile) else SequenceFile.model_validate(content)
     except ValidationError as error:
         place, text = validation_message(error, SequenceFile)
-        raise InputError(f"The sequence has a fault at '{place}': {text}.", file=path, key=place) from None
+        raise InputError(
+            f"The sequence to be written has a fault at '{place}': {text}.",
+            file=path,
+            key=place,
+            remedy="mend that value",
+        ) from None
     text = yaml.safe_dump(file.to_dict(), sort_keys=False, allow_unicode=True, width=110)
     path.write_text(text, encoding="utf-8")

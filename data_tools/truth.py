@@ -10,6 +10,7 @@ import numpy as np
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:
+    import pandas as pd
     import xarray as xr
 
     from acino_fte.skeleton import Skeleton
@@ -70,22 +71,27 @@ def read_truth(path: Path | str, skeleton: Skeleton, n_frames: int) -> xr.DataAr
     )
 
 
-def _read_table(path: Path):  # type: ignore[no-untyped-def]
+def _read_table(path: Path) -> pd.DataFrame:
     import pandas as pd
 
-    fault = {"file": path, "expected": f"CSV with the columns {', '.join(COLUMNS)}"}
+    expected = f"CSV with the columns {', '.join(COLUMNS)}"
     try:
         table = pd.read_csv(path, dtype={"marker": str, **dict.fromkeys("xyz", float), "frame": float})
     except FileNotFoundError:
         raise InputError("The truth file does not exist.", file=path, remedy="mend 'truth'") from None
     except (ValueError, OSError) as error:  # pandas' ParserError and EmptyDataError are ValueErrors
         raise InputError(
-            "The truth file cannot be read.", **fault, found=str(error), remedy="mend or leave out 'truth'"
+            "The truth file cannot be read.",
+            file=path,
+            expected=expected,
+            found=str(error),
+            remedy="mend it, or leave out 'truth'",
         ) from None
     if not set(COLUMNS) <= set(table.columns):
         raise InputError(
             "The truth file lacks a column.",
-            **fault,
+            file=path,
+            expected=expected,
             found=", ".join(map(str, table.columns)),
             remedy="name the columns in its first line",
         )
