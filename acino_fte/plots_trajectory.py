@@ -91,9 +91,8 @@ def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pose_frames(n_frames: int, poses: int = _POSES) -> np.ndarray:
-    """Indices of about ``poses`` frames, every k-th one."""
-    step = max(1, int(np.ceil((n_frames - 1) / (poses - 1)))) if n_frames > 1 else 1
-    return np.arange(0, n_frames, step)
+    """Indices of ``poses`` frames spread evenly, with the first and the last."""
+    return np.unique(np.linspace(0, n_frames - 1, min(poses, n_frames)).round().astype(int))
 
 
 def travel_frame(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -49,7 +49,7 @@ def to_dataset(result: FTEResult) -> xr.Dataset:
 
     References
     ----------
-    The movement package (Sirmpilatze et al., Zenodo, doi:10.5281/zenodo.12755724): dataset of type poses.
+    The movement package, https://movement.neuroinformatics.dev: its dataset of poses.
     """
     seen = np.isfinite(result.observed).all(-1)
     keypoints = ("time", "keypoints", "individuals")
