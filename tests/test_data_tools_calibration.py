@@ -58,10 +58,11 @@ def anipose(cameras, scale=1.0):
     text = ""
     for i, c in enumerate(cameras):
         vector = Rotation.from_matrix(c.rotation).as_rotvec().tolist()
+        fisheye = str(c.model == "fisheye").lower()
         text += (
             f"[cam_{i}]\nname = '{c.name}'\nsize = [1920, 1080]\nmatrix = {c.matrix.tolist()}\n"
             f"distortions = {c.distortion.tolist()}\nrotation = {vector}\n"
-            f"translation = {(c.translation * scale).tolist()}\nfisheye = {str(c.model == 'fisheye').lower()}\n\n"
+            f"translation = {(c.translation * scale).tolist()}\nfisheye = {fisheye}\n\n"
         )
     return text + "[metadata]\nadjusted = false\nerror = 0.4\n"
 
