@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.skeleton import Skeleton
+
+_MISSPELT = 0.8  # r_front_knee is no misspelt r_knee (0.67), tail_bass is a misspelt tail_base (0.89)
 
 
 def match_markers(names: tuple[str, ...], skeleton: Skeleton, path: Path) -> dict[str, str]:
@@ -63,8 +66,13 @@ def match_warnings(
     dropped = [n for n in every if not any(n in match for match in matches.values())]
     warnings = []
     if dropped:
-        near = ", ".join(f"'{name}'{did_you_mean(name, free)}" for name in dropped)
+        near = ", ".join(f"'{name}'{_misspelt(name, free)}" for name in dropped)
         warnings.append(f"Keypoints that species '{skeleton.name}' does not have are left out: {near}")
+    if len(dropped) > 0.5 * len(every):
+        warnings.append(
+            f"Only {len(every) - len(dropped)} of {len(every)} keypoints belong to species "
+            f"'{skeleton.name}': is it the right one?"
+        )
     if free:
         warnings.append(
             f"Markers of species '{skeleton.name}' that no keypoint file has: {', '.join(free)}. "
@@ -75,3 +83,9 @@ def match_warnings(
         if lacking:
             warnings.append(f"The keypoint file of camera '{camera}' lacks {', '.join(lacking)}.")
     return warnings
+
+
+def _misspelt(name: str, markers: list[str]) -> str:
+    """A suggestion for a keypoint that is a marker but for a letter or so."""
+    near = get_close_matches(name.lower(), markers, n=1, cutoff=_MISSPELT)
+    return f"; did you mean '{near[0]}'?" if near else ""

@@ -197,6 +197,12 @@ def test_a_marker_that_one_file_lacks(tmp_path):
     assert any("'cam2' lacks nose" in w for w in sequence.warnings)
 
 
+def test_a_species_that_most_keypoints_do_not_belong_to(tmp_path):
+    warnings = load_sequence(write_recording(tmp_path), species="human").warnings
+    assert any("is it the right one?" in w for w in warnings)
+    assert not any("did you mean" in w for w in warnings)
+
+
 def test_no_marker_at_all_lists_near_misses(tmp_path):
     folder = write_recording(tmp_path, names=[f"{m}xx" for m in MARKERS])
     error = message(load_sequence, folder)
