@@ -161,6 +161,7 @@ class Camera:
         target = np.stack([(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy])
         angle_of, bent = self._radial_table
         radius = np.hypot(target[0], target[1])
+        target = np.where(radius < 1.2 * bent[-1], target, np.nan)  # hopelessly far outside
         angle = np.interp(radius, bent, angle_of)
         guess = target * np.tan(angle) / np.where(radius > 0, radius, 1.0)
         distort = _compiled(self.model)["distort"]
@@ -169,7 +170,7 @@ class Camera:
             for _ in range(_NEWTON_STEPS):
                 distort([guess[0], guess[1], *self.parameters], out)
                 e0, e1 = target[0] - out[0], target[1] - out[1]
-                if not np.nanmax(np.abs(e0) + np.abs(e1), initial=0.0) > 1e-14:
+                if not np.nanmax(np.abs(e0) + np.abs(e1), initial=0.0) > 1e-13:
                     break
                 determinant = out[2] * out[5] - out[3] * out[4]
                 guess = guess + np.stack([out[5] * e0 - out[3] * e1, out[2] * e1 - out[4] * e0]) / determinant

@@ -128,8 +128,12 @@ class Condensed:
     # --- value -------------------------------------------------------------------------------------
 
     def objective(self, x: np.ndarray) -> float:
-        """Σ ρ(r/σ) at x (N·Q,)."""
-        return float(sum(self.term_values(x).values()))
+        """Σ ρ(r/σ) at x (N·Q,).
+
+        Derivatives are evaluated along with it: IPOPT asks for them next whenever it accepts the point.
+        """
+        self._linearise(x)
+        return float(sum(losses[0].sum() for losses in self._losses))
 
     def term_values(self, x: np.ndarray) -> dict[str, float]:
         """The objective by family of terms."""

@@ -6,6 +6,7 @@ A start with all joints at zero ends in bad local minima; this one does not (see
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from acino_fte.errors import InputError
 from acino_fte.kinematics import Kinematics
@@ -17,7 +18,8 @@ from acino_fte.terms import point_term
 from acino_fte.triangulate import triangulate
 
 _POINT_SD = 0.03  # m, spread of triangulated markers about the skeleton: segment lengths are generic
-_IK = SolveOptions(max_iter=60, tolerance=0.3, acceptable_tolerance=3.0)
+_ENOUGH = 3e-3  # relative decrease of the objective per iteration below which the start is good enough
+_COARSE = 3  # the start is solved on every third frame and interpolated: it only has to be near
 
 
 def initialise(sequence: Sequence, kinematics: Kinematics, options: FTEOptions | None = None) -> np.ndarray:
@@ -52,9 +54,17 @@ def smooth_inverse_kinematics(
 ) -> np.ndarray:
     """Fit q (N, Q) to marker positions (N, M, 3), NaN where unknown, under the motion model."""
     options = options or FTEOptions()
-    term = point_term(points, _POINT_SD, Loss("cauchy", {"c": 2.0}))
-    problem = build_problem(kinematics, fps, frames, [term], options)
-    return minimise(problem, start, _IK).q
+    stride = _COARSE if len(points) >= 8 * _COARSE else 1
+    chosen = np.unique(np.r_[np.arange(0, len(points), stride), len(points) - 1])
+    if chosen[-1] - chosen[-2] < stride:  # keep the spacing even; the last frames are extrapolated
+        chosen = chosen[:-1]
+    term = point_term(points[chosen], _POINT_SD, Loss("cauchy", {"c": 2.0}))
+    problem = build_problem(kinematics, fps / stride, frames[chosen], [term], options)
+    settings = SolveOptions(max_iter=60, tolerance=1.0, acceptable_tolerance=10.0)
+    q = minimise(problem, start[chosen], settings, enough=_ENOUGH).q
+    if stride > 1:
+        q = CubicSpline(chosen, q, axis=0)(np.arange(len(points)))
+    return problem.clip(q)
 
 
 def pose_start(kinematics: Kinematics, points: np.ndarray) -> np.ndarray:

@@ -58,7 +58,7 @@ class SolveOptions:
     """
 
     max_iter: int = 500
-    tolerance: float = 1e-3
+    tolerance: float = 0.1
     acceptable_tolerance: float = 1.0
     max_seconds: float = 3600.0
     print_level: int = 0
@@ -75,19 +75,21 @@ class SolveOptions:
         ):
             if not good:
                 raise InputError(
-                    f"The solver option {name} cannot be {getattr(self, name)!r}.", key=name, remedy="see --help"
+                    f"The solver option {name} cannot be {getattr(self, name)!r}.",
+                    key=name,
+                    remedy="see --help",
                 )
 
     def ipopt(self) -> dict[str, str | float | int]:
         """The options in IPOPT's words."""
         return {
             "max_iter": self.max_iter,
-            "tol": self.tolerance,
-            "dual_inf_tol": self.tolerance,
-            "acceptable_tol": self.acceptable_tolerance,
-            "acceptable_dual_inf_tol": self.acceptable_tolerance,
+            "tol": float(self.tolerance),
+            "dual_inf_tol": float(self.tolerance),
+            "acceptable_tol": float(self.acceptable_tolerance),
+            "acceptable_dual_inf_tol": float(self.acceptable_tolerance),
             "acceptable_iter": 10,
-            "max_wall_time": self.max_seconds,
+            "max_wall_time": float(self.max_seconds),
             "print_level": self.print_level,
             "sb": "yes",
             "linear_solver": self.linear_solver,
@@ -112,13 +114,14 @@ class Minimum:
 class _Callbacks:
     """What IPOPT calls: the condensed problem, progress, and the best iterate so far."""
 
-    def __init__(self, condensed: Condensed, progress: Progress | None) -> None:
+    def __init__(self, condensed: Condensed, progress: Progress | None, enough: float) -> None:
         self.condensed = condensed
         self.progress = progress
+        self.enough = enough
         self.stop = False
         self.iterations = 0
         self.best = (np.inf, np.empty(0))
-        self._last: tuple[np.ndarray, float] | None = None
+        self._last = np.inf
 
     def objective(self, x: np.ndarray) -> float:
         """Value, remembered when it is the best so far."""
@@ -144,7 +147,9 @@ class _Callbacks:
         self.iterations = iteration
         if self.progress is not None:
             self.progress(iteration, value)
-        return not self.stop
+        settled = 0 <= self._last - value < self.enough * abs(value)
+        self._last = value
+        return not (self.stop or settled)
 
 
 def minimise(
@@ -152,18 +157,20 @@ def minimise(
     start: np.ndarray,
     options: SolveOptions | None = None,
     progress: Progress | None = None,
+    enough: float = 0.0,
 ) -> Minimum:
     """Minimise a problem from q (N, Q) by its condensed lowering.
 
-    Ctrl-C ends it with the best iterate so far and the status ``interrupted``.
+    Ctrl-C ends it with the best iterate so far and the status ``interrupted``. ``enough`` stops it early
+    once an iteration lowers the objective by less than this fraction: for a start, not for a result.
     """
     import cyipopt
 
     options = options or SolveOptions()
     condensed = Condensed(problem, options.hessian)
-    callbacks = _Callbacks(condensed, progress)
+    callbacks = _Callbacks(condensed, progress, enough)
     n = problem.n_frames
-    start = problem.clip(start, margin=1e-3)
+    start = problem.clip(start)
     solver = cyipopt.Problem(
         n=start.size,
         m=0,
@@ -179,14 +186,18 @@ def minimise(
     value = float(info["obj_val"])
     if not status.ok and callbacks.best[0] < np.inf:
         value, x = callbacks.best
-    return Minimum(status, np.clip(x.reshape(start.shape), problem.lower, problem.upper), value, callbacks.iterations)
+    return Minimum(
+        status, np.clip(x.reshape(start.shape), problem.lower, problem.upper), value, callbacks.iterations
+    )
 
 
 _STRATEGY: dict[str, str | float | int] = {
     "mu_strategy": "adaptive",
-    "bound_push": 1e-6,
-    "bound_frac": 1e-6,
-    "mu_init": 1e-4,
+    "mu_min": 1e-5,  # a joint at its limit costs the objective no more than this
+    "bound_push": 1e-2,
+    "bound_frac": 1e-2,
+    "mumps_permuting_scaling": 0,  # the Hessian is positive semidefinite and well scaled as it is
+    "mumps_scaling": 0,
 }
 
 

@@ -28,6 +28,8 @@ from acino_fte.skeleton import Skeleton
 if TYPE_CHECKING:
     import sympy as sp
 
+Let = Callable[[str, Any], Any]
+
 _AXES = ("x", "y", "z")
 _STENCIL = {"dof": (1,), "velocity": (1, -1), "acceleration": (1, -2, 1)}
 
@@ -67,9 +69,10 @@ class Residual:
     unit : str
         Unit of the residual and of its standard deviation.
     derive : callable
-        ``derive(handles, data) → (components, guards)``: SymPy expressions. ``handles`` has a 3-tuple of
-        symbols for a position and a symbol for the rest. Where a guard is not positive the residual is
-        infinite (a point behind the camera).
+        ``derive(handles, data, let) → (components, guards)``: SymPy expressions. ``handles`` has a
+        3-tuple of symbols for a position and a symbol for the rest. ``let(name, expression)`` names an
+        intermediate result; derivatives then follow the chain rule over such names instead of growing
+        by expansion. Where a guard is not positive the residual is infinite (a point behind the camera).
     sources : tuple of Path
         Files that the formula depends on, for the cache; without them it is derived anew each time.
     """
@@ -79,7 +82,7 @@ class Residual:
     data: tuple[str, ...]
     components: tuple[str, ...]
     unit: str
-    derive: Callable[[list[Any], dict[str, sp.Symbol]], tuple[list[sp.Expr], list[sp.Expr]]]
+    derive: Callable[[list[Any], dict[str, sp.Symbol], Let], tuple[list[sp.Expr], list[sp.Expr]]]
     sources: tuple[Path, ...] = ()
 
     def __hash__(self) -> int:
@@ -156,8 +159,9 @@ def residual_program(residual: Residual) -> Program:
 
     def derive() -> dict[str, Program]:
         handles, data, flat = _symbols(residual)
-        components, _ = residual.derive(handles, data)
-        return {"declared": ProgramBuilder([*flat, *data.values()]).program(components)}
+        builder = ProgramBuilder([*flat, *data.values()])
+        components, _ = residual.derive(handles, data, builder.let)
+        return {"declared": builder.program(components)}
 
     return _cached(residual, "declared", derive)["declared"]
 
@@ -223,16 +227,74 @@ def _derive_lowered(residual: Residual, inputs: tuple[tuple[str, int, int], ...]
             values.append(tuple(place[stencil[0][0]]))
         else:
             values.append(sum(w * place[key][0] for key, w in stencil) / data["dt"] ** (len(stencil) - 1))
-    components, guards = residual.derive(values, data)
-    first = [sp.diff(c, s) for c in components for s in y]
-    second = [sp.diff(c, y[i], y[j]) for c in components for i in range(n) for j in range(i + 1)]
-    arguments = [*y, *data.values()]
+    chain = _Chain([*y, *data.values()], y)
+    components, guards = residual.derive(values, data, chain.let)
     base = [*components, *guards]
+    first = [d for c in components for d in chain.first(c)]
+    second = [d for c in components for d in chain.second(c)]
+    builder = chain.builder
     return {
-        "value": ProgramBuilder(arguments).program(base),
-        "slope": ProgramBuilder(arguments).program(base + first),
-        "curvature": ProgramBuilder(arguments).program(base + first + second),
+        "value": builder.program(base),
+        "slope": builder.program(base + first),
+        "curvature": builder.program(base + first + second),
     }
+
+
+class _Chain:
+    """Forward differentiation over named intermediate results.
+
+    With s = g(a, b, …) of earlier names:  ∂s/∂y_i = Σ_a g_a ∂a/∂y_i  and
+    ∂²s/∂y_i∂y_j = Σ_ab g_ab ∂a/∂y_i ∂b/∂y_j + Σ_a g_a ∂²a/∂y_i∂y_j.
+    """
+
+    def __init__(self, arguments: list[sp.Symbol], variables: list[sp.Symbol]) -> None:
+        import sympy as sp
+
+        self.builder = ProgramBuilder(arguments)
+        n = len(variables)
+        self.pairs = [(i, j) for i in range(n) for j in range(i + 1)]
+        self._first = {y: [sp.Integer(int(i == k)) for i in range(n)] for k, y in enumerate(variables)}
+        self._second: dict[sp.Symbol, list[sp.Expr]] = {y: [sp.Integer(0)] * len(self.pairs) for y in variables}
+
+    def let(self, name: str, expression: sp.Expr) -> sp.Expr:
+        """Name an intermediate result and keep its derivatives."""
+        symbol = self.builder.let(name, expression)
+        if symbol.is_Symbol and symbol not in self._first:
+            self._first[symbol] = [
+                self.builder.let(f"{name}_d{i}", d) for i, d in enumerate(self.first(expression))
+            ]
+            self._second[symbol] = [
+                self.builder.let(f"{name}_dd{i}", d) for i, d in enumerate(self.second(expression))
+            ]
+        return symbol
+
+    def _moving(self, expression: sp.Expr) -> list[sp.Symbol]:
+        return sorted((s for s in expression.free_symbols if s in self._first), key=str)
+
+    def first(self, expression: sp.Expr) -> list[sp.Expr]:
+        """∂expression/∂y_i for every variable."""
+        import sympy as sp
+
+        inner = self._moving(expression)
+        outer = [sp.diff(expression, a) for a in inner]
+        count = len(next(iter(self._first.values()), []))
+        return [
+            sp.Add(*(g * self._first[a][i] for g, a in zip(outer, inner, strict=True))) for i in range(count)
+        ]
+
+    def second(self, expression: sp.Expr) -> list[sp.Expr]:
+        """∂²expression/∂y_i∂y_j for every pair i ≥ j."""
+        import sympy as sp
+
+        inner = self._moving(expression)
+        result = []
+        slopes = {a: sp.diff(expression, a) for a in inner}
+        bends = {(a, b): sp.diff(slopes[a], b) for a in inner for b in inner}
+        for place, (i, j) in enumerate(self.pairs):
+            bent = [g * self._first[a][i] * self._first[b][j] for (a, b), g in bends.items()]
+            carried = [slopes[a] * self._second[a][place] for a in inner]
+            result.append(sp.Add(*bent, *carried))
+        return result
 
 
 # --- the residuals of the full trajectory estimation -------------------------------------------------
@@ -244,10 +306,13 @@ _POSE = tuple(f"r{i}{j}" for i in range(3) for j in range(3)) + ("tx", "ty", "tz
 def measurement_residual(model: str) -> Residual:
     """Reprojection residual of a marker, px: π(R·p + t) − (u, v)."""
 
-    def derive(handles: list[Any], data: dict[str, sp.Symbol]) -> tuple[list[sp.Expr], list[sp.Expr]]:
+    def derive(
+        handles: list[Any], data: dict[str, sp.Symbol], let: Let
+    ) -> tuple[list[sp.Expr], list[sp.Expr]]:
         (p,) = handles
         local = [
-            sum(data[f"r{i}{j}"] * p[j] for j in range(3)) + data[f"t{_AXES[i]}"] for i in range(3)
+            let(f"local_{_AXES[i]}", sum(data[f"r{i}{j}"] * p[j] for j in range(3)) + data[f"t{_AXES[i]}"])
+            for i in range(3)
         ]
         u, v = projection.project(model, (local[0], local[1], local[2]))
         return [u - data["u"], v - data["v"]], [local[2]]
@@ -257,16 +322,22 @@ def measurement_residual(model: str) -> Residual:
     return Residual(f"{model}", (Handle("position"),), data, ("u", "v"), "px", derive, source)
 
 
-def _jump(handles: list[Any], _: dict[str, sp.Symbol]) -> tuple[list[sp.Expr], list[sp.Expr]]:
+def _jump(
+    handles: list[Any], _: dict[str, sp.Symbol], _let: Let
+) -> tuple[list[sp.Expr], list[sp.Expr]]:
     now, before = handles
     return [now - before], []
 
 
-def _from_mean(handles: list[Any], data: dict[str, sp.Symbol]) -> tuple[list[sp.Expr], list[sp.Expr]]:
+def _from_mean(
+    handles: list[Any], data: dict[str, sp.Symbol], _let: Let
+) -> tuple[list[sp.Expr], list[sp.Expr]]:
     return [handles[0] - data["mean"]], []
 
 
-def _to_point(handles: list[Any], data: dict[str, sp.Symbol]) -> tuple[list[sp.Expr], list[sp.Expr]]:
+def _to_point(
+    handles: list[Any], data: dict[str, sp.Symbol], _let: Let
+) -> tuple[list[sp.Expr], list[sp.Expr]]:
     return [handles[0][i] - data[f"p{a}"] for i, a in enumerate(_AXES)], []
 
 
