@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 
@@ -54,7 +54,8 @@ def save_figures(result: FTEResult, folder: Path | str) -> list[Path]:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     written = []
-    with matplotlib.rc_context(dict(matplotlib.rcParamsDefault) | STYLE):
+    style: Any = {**dict(matplotlib.rcParamsDefault), **STYLE}  # whatever the user's own settings are
+    with matplotlib.rc_context(style):
         for name, (_, draw) in FIGURES.items():
             figure = draw(result)
             written += [folder / f"{name}.png", folder / f"{name}.pdf"]

@@ -68,7 +68,9 @@ def camera_figure(result: FTEResult) -> Figure:
     metrics = reprojection_metrics(result)["per_camera"]
     figure = new_figure(result, "Reprojection error by camera", 8.2, 1.25 + 1.15 * len(names), top=0.85)
     margins(figure, 1.15, 0.2, 0.5, wspace=0.16, hspace=0.3)
-    panels = figure.subplots(len(names), 2, sharex="col", squeeze=False, width_ratios=(1, 1.1))
+    panels = figure.subplots(len(names), 2, squeeze=False, width_ratios=(1, 1.1))  # sharing axes is slow
+    for axes in panels[:-1].ravel():
+        axes.tick_params(axis="x", labelbottom=False)
     reach = axis_reach(result)
     errors = point_errors(result)
     for c, (name, (signed, absolute)) in enumerate(zip(names, panels, strict=True)):

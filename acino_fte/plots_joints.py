@@ -38,7 +38,7 @@ def joint_figure(result: FTEResult) -> Figure:
     rows = max(1, math.ceil(len(groups) / _COLUMNS))
     figure = new_figure(result, "Joint angles and their limits", 10.0, 1.4 + 1.35 * rows, top=1.05)
     margins(figure, 0.62, 0.15, 0.5, wspace=0.25, hspace=0.42)
-    panels = figure.subplots(rows, _COLUMNS, sharex=True, squeeze=False).ravel()
+    panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()  # sharing axes is slow
     height = float(figure.get_size_inches()[1])
     keys = (
         (0.62, "— left, or single", BLUE),
@@ -57,7 +57,8 @@ def joint_figure(result: FTEResult) -> Figure:
             axes.yaxis.set_label_coords(-0.2, 0.5)
         if i + _COLUMNS >= len(groups):
             axes.set_xlabel("Time (s)")
-            axes.tick_params(axis="x", labelbottom=True)
+        else:
+            axes.tick_params(axis="x", labelbottom=False)
     return figure
 
 
@@ -66,6 +67,7 @@ def _joint_panel(axes: Axes, result: FTEResult, group: list[int]) -> None:
     values = np.degrees(result.q[:, group])
     for column, colour in zip(values.T, (BLUE, ORANGE), strict=False):
         axes.plot(times(result), column, color=colour, marker="." if len(column) == 1 else None)
+    axes.locator_params(axis="x", nbins=4)
     axes.set_title(_panel_title([dof.name for dof in dofs]), fontsize=8.5, loc="left", pad=3)
     lower, upper = np.degrees(dofs[0].lower), np.degrees(dofs[0].upper)
     if not (math.isfinite(lower) and math.isfinite(upper)):

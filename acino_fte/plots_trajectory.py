@@ -55,7 +55,9 @@ def trajectory_figure(result: FTEResult) -> Figure:
     panels[2].set_ylabel("To the left (m)")
     panels[2].set_title("From above; dotted: mean of all markers", loc="left", pad=3)
     heading = np.degrees(np.arctan2(along[1], along[0]))
-    panels[2].set_xlabel(f"Along the direction of travel (m), which is {heading:+.0f}° from world x")
+    panels[2].set_xlabel(
+        f"Along the direction of travel (m), which is {heading:.0f}° from world x".replace("-", "−")
+    )
     low, high = panels[2].get_position().y0, panels[1].get_position().y1
     bar = figure.add_axes((1 - 0.72 / _WIDTH, low, 0.14 / _WIDTH, high - low))
     figure.colorbar(ScalarMappable(norm, _COLOURS), cax=bar, label="Time (s)")
@@ -105,6 +107,7 @@ def travel_frame(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     spread = (positions - centre[:, None])[..., :2].reshape(-1, 2)
     if np.linalg.norm(shift) < 2 * spread.std():
         shift = np.linalg.svd(spread - spread.mean(0), full_matrices=False)[2][0]
+        shift = shift if shift[0] > 0 else -shift
     along = np.array([*(shift / max(np.linalg.norm(shift), 1e-12)), 0.0])
     left = np.array([-along[1], along[0], 0.0])
     local = np.stack([positions @ along, positions @ left, positions[..., 2]], axis=-1)

@@ -97,7 +97,7 @@ def _cards(metrics: dict[str, Any]) -> str:
         (number(error["median"], "px"), "median reprojection error"),
         (share(error["within_20px"]), "of the observations within 20 px"),
         (share(error["outlier_ratio"], 1), f"outliers, beyond {error['outlier_beyond_sd']:g} sd"),
-        (f"{metrics['n_observations']:,}", f"observations, {metrics['n_cameras']} cameras"),
+        (f"{metrics['n_observations']:,}", f"observations; cameras: {metrics['n_cameras']}"),
         (f"{end - start:,}", f"frames, {start}–{end - 1}, at {metrics['fps']:g}/s"),
         (number(metrics["speed_m_s"]["body"], "m/s", 2), "median speed of the body"),
         (number(seconds["total"], "s", 2), f"in all; {number(metrics['realtime_factor'], '×', 2)} real time"),

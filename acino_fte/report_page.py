@@ -75,8 +75,8 @@ button, select { font: inherit; padding: .2rem .7rem; }
 
 VIEWER = """
 <div id="viewer">
-<canvas id="scene" tabindex="0" aria-label="Skeleton in three dimensions. Drag to turn, wheel to zoom, arrow keys
-to step, space to play."></canvas>
+<canvas id="scene" tabindex="0" aria-label="Skeleton in three dimensions. Drag to turn, wheel to zoom,
+arrow keys to step, space to play."></canvas>
 <div class="keys">drag: turn · shift-drag: move · wheel: zoom · ← →: step · space: play<br>
 <span class="left">left</span> · <span class="right">right</span> · grid: @grid@ m</div>
 <div class="controls">
@@ -84,7 +84,8 @@ to step, space to play."></canvas>
 <input id="slider" type="range" min="0" value="0" aria-label="Frame">
 <output id="clock"></output>
 <label>Speed <select id="speed"><option value="0.05">1/20</option><option value="0.1">1/10</option>
-<option value="0.25" selected>1/4</option><option value="0.5">1/2</option><option value="1">1</option></select></label>
+<option value="0.25" selected>1/4</option><option value="0.5">1/2</option>
+<option value="1">1</option></select></label>
 <label><input id="follow" type="checkbox" checked> follow</label>
 <label><input id="cameras" type="checkbox" checked> cameras</label>
 <label><input id="labels" type="checkbox"> names</label>
@@ -125,7 +126,8 @@ SCRIPT = """
   reset();
 
   function basis() {
-    const cy = Math.cos(view.yaw), sy = Math.sin(view.yaw), cp = Math.cos(view.pitch), sp = Math.sin(view.pitch);
+    const cy = Math.cos(view.yaw), sy = Math.sin(view.yaw);
+    const cp = Math.cos(view.pitch), sp = Math.sin(view.pitch);
     const back = [cy * cp, sy * cp, sp];  // from the target to the eye
     return { back: back, right: [-sy, cy, 0], up: [-cy * sp, -sy * sp, cp] };
   }
@@ -145,7 +147,7 @@ SCRIPT = """
     return [canvas.clientWidth / 2 + k * dot(d, eye.b.right), canvas.clientHeight / 2 - k * dot(d, eye.b.up)];
   }
   function clip(p, q) {  // cut a segment at the plane just before the eye
-    const near = 0.06, depth = (x) => -dot([x[0] - eye.at[0], x[1] - eye.at[1], x[2] - eye.at[2]], eye.b.back);
+    const near = 0.06, depth = (x) => -dot(x.map((v, i) => v - eye.at[i]), eye.b.back);
     const a = depth(p), c = depth(q);
     if (a < near && c < near) { return null; }
     const cut = (x, y, dx, dy) => x.map((v, i) => v + (near - dx) / (dy - dx) * (y[i] - v));
@@ -168,7 +170,8 @@ SCRIPT = """
     for (let x = g.x0; x <= g.x1 + 1e-6; x += g.step) { line([x, g.y0, z], [x, g.y1, z], "#dddddd", 1); }
     for (let y = g.y0; y <= g.y1 + 1e-6; y += g.step) { line([g.x0, y, z], [g.x1, y, z], "#dddddd", 1); }
     const o = [g.x0, g.y0, z], s = g.step;
-    [["x", "#d55e00", [s, 0, 0]], ["y", "#009e73", [0, s, 0]], ["z", "#0072b2", [0, 0, s]]].forEach((axis) => {
+    const axes = [["x", "#d55e00", [s, 0, 0]], ["y", "#009e73", [0, s, 0]], ["z", "#0072b2", [0, 0, s]]];
+    axes.forEach((axis) => {
       const tip = o.map((v, a) => v + axis[2][a]);
       line(o, tip, axis[1], 2); text(tip, axis[0], axis[1]);
     });
@@ -207,7 +210,8 @@ SCRIPT = """
       if (element("labels").checked) { text(point(frame, i), marker.name, "#333333"); }
     });
     slider.value = frame;
-    clock.textContent = "frame " + data.frames[frame] + " · " + (data.frames[frame] / data.fps).toFixed(3) + " s";
+    const number = data.frames[frame];
+    clock.textContent = "frame " + number + " · " + (number / data.fps).toFixed(3) + " s";
   }
   function show(f) { frame = Math.max(0, Math.min(n - 1, f)); progress = frame; draw(); }
   function toggle() {
@@ -249,7 +253,8 @@ SCRIPT = """
     const inSelect = e.target.tagName === "SELECT", inButton = e.target.tagName === "BUTTON";
     if (inSelect) { return; }
     const step = e.shiftKey ? 10 : 1;
-    if (e.key === "ArrowRight") { show(frame + step); } else if (e.key === "ArrowLeft") { show(frame - step); }
+    if (e.key === "ArrowRight") { show(frame + step); }
+    else if (e.key === "ArrowLeft") { show(frame - step); }
     else if (e.key === "Home") { show(0); } else if (e.key === "End") { show(n - 1); }
     else if (e.key === "ArrowUp") { zoom(0.9); } else if (e.key === "ArrowDown") { zoom(1.1); }
     else if (e.key === " " && !inButton && e.target.type !== "checkbox") { toggle(); } else { return; }

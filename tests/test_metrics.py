@@ -8,8 +8,11 @@ from synthetic_result import FPS, make_result
 from acino_fte.metrics import OUTLIER_SD, joints_outside_limits, json_safe, realtime_factor, result_metrics
 from acino_fte.result import Status
 
-FIELDS = """status species method frames fps n_cameras n_markers n_observations objective iterations seconds
-realtime_factor reprojection_px parameters version options""".split()
+FIELDS = (
+    ["status", "species", "method", "frames", "fps", "n_cameras", "n_markers", "n_observations"]
+    + ["objective", "iterations", "seconds", "realtime_factor", "reprojection_px", "parameters"]
+    + ["version", "options"]
+)
 
 
 @pytest.fixture(scope="module")
