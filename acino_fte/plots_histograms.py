@@ -27,14 +27,15 @@ def error_figure(result: FTEResult) -> Figure:
     for axis, axes, colour in zip((0, 1), panels[:2], (BLUE, ORANGE), strict=True):
         values = result.residuals[..., axis].ravel()
         values = values[np.isfinite(values)]
-        histogram(axes, values, (-reach, reach), colour)
+        outside = histogram(axes, values, (-reach, reach), colour)
         axes.set_title(("Horizontal, u", "Vertical, v")[axis], loc="left")
         axes.set_xlabel(f"Reprojected − detected, {'uv'[axis]} (px)")
         axes.axvline(0, color=GREY, lw=0.7)
         if values.size:
             rms = np.sqrt(np.mean(values**2))
             lines = f"median {np.median(values):+.1f} px\nsd {values.std():.1f} px\nRMSE {rms:.1f} px"
-            note(axes, f"{lines}\nIQR {np.subtract(*np.percentile(values, [75, 25])):.1f} px")
+            iqr = np.subtract(*np.percentile(values, [75, 25]))
+            note(axes, f"{lines}\nIQR {iqr:.1f} px{outside}".replace("-", "−"))
     panels[0].set_ylabel("Observations")
     _absolute_panel(panels[2], result, reach)
     return figure
@@ -43,7 +44,7 @@ def error_figure(result: FTEResult) -> Figure:
 def _absolute_panel(axes: Axes, result: FTEResult, reach: float) -> None:
     errors = finite_errors(result)
     metrics = reprojection_metrics(result)
-    histogram(axes, errors, (0, reach), GREEN)
+    outside = histogram(axes, errors, (0, reach), GREEN)
     axes.set_title("Absolute", loc="left")
     axes.set_xlabel("Reprojection error (px)")
     axes.axvline(NEAR_PX, color=RED, lw=1, ls="--")
@@ -58,7 +59,8 @@ def _absolute_panel(axes: Axes, result: FTEResult, reach: float) -> None:
         f"RMSE {metrics['rmse']:.1f} px, sd {metrics['std']:.1f} px\n"
         f"{metrics['within_20px']:.1%} within 20 px (dashed)\n"
         f"{metrics['outlier_ratio']:.1%} beyond {metrics['outlier_beyond_sd']:g} sd"
-        + (f"\n{behind} behind the camera" if behind else ""),
+        + (f"\n{behind} behind the camera" if behind else "")
+        + outside,
     )
 
 
@@ -76,14 +78,14 @@ def camera_figure(result: FTEResult) -> Figure:
     for c, (name, (signed, absolute)) in enumerate(zip(names, panels, strict=True)):
         for axis, colour in ((0, BLUE), (1, ORANGE)):
             values = result.residuals[:, c, :, axis].ravel()
-            histogram(signed, values[np.isfinite(values)], (-reach, reach), colour, fill=False, tell=False)
+            histogram(signed, values[np.isfinite(values)], (-reach, reach), colour, fill=False)
         signed.axvline(0, color=GREY, lw=0.7)
         signed.set_ylabel(f"{name}\nobservations")
         found = errors[:, c][np.isfinite(errors[:, c])]
-        histogram(absolute, found, (0, reach), GREEN)
+        outside = histogram(absolute, found, (0, reach), GREEN)
         absolute.axvline(NEAR_PX, color=RED, lw=1, ls="--")
         if metrics[name]["mean"] is not None:
-            note(absolute, _short(metrics[name]))
+            note(absolute, _short(metrics[name]) + outside)
     panels[0, 0].set_title("Signed: u blue, v orange", loc="left")
     panels[0, 1].set_title("Absolute (20 px dashed)", loc="left")
     panels[-1, 0].set_xlabel("Reprojected − detected (px)")
@@ -175,30 +177,20 @@ def axis_reach(result: FTEResult) -> float:
 
 
 def histogram(
-    axes: Axes,
-    values: np.ndarray,
-    span: tuple[float, float],
-    colour: str,
-    *,
-    fill: bool = True,
-    tell: bool = True,
-) -> None:
-    """A histogram over a span (px); what lies outside is counted in the panel when ``tell``."""
+    axes: Axes, values: np.ndarray, span: tuple[float, float], colour: str, *, fill: bool = True
+) -> str:
+    """Draw a histogram over a span (px); return a line saying which share of the values lies outside."""
     axes.set_xlim(span)
     if not values.size:
         nothing(axes)
-        return
+        return ""
     counts, edges = np.histogram(values, bins=_BINS, range=span)
     axes.stairs(counts, edges, fill=fill, color=colour, alpha=0.8 if fill else 1.0, lw=1.1)
     axes.set_ylim(0, max(1.0, 1.05 * counts.max(), axes.get_ylim()[1] if not fill else 0))
     outside = 1.0 - counts.sum() / values.size
-    if tell and outside > 0:
-        axes.text(
-            0.99, 0.02, f"{outside:.1%} outside", transform=axes.transAxes, ha="right", fontsize=7, color=GREY
-        )
+    return f"\n{outside:.1%} off axis" if outside > 0 else ""
 
 
 def note(axes: Axes, text: str) -> None:
     """Statistics in the upper right corner of a panel."""
-    box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5}
-    axes.text(0.99, 0.98, text, transform=axes.transAxes, ha="right", va="top", fontsize=7.5, bbox=box)
+    axes.text(0.99, 0.98, text, transform=axes.transAxes, ha="right", va="top", fontsize=7.5)

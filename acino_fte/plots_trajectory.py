@@ -143,8 +143,8 @@ def ground_grid(local: np.ndarray) -> list[np.ndarray]:
     length = max(high[0] - low[0], high[1] - low[1])
     step = next((s for s in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0) if length / s <= 14), length / 10)
     lines = [np.arange(np.floor(low[i] / step), np.ceil(high[i] / step) + 1) * step for i in (0, 1)]
-    ground = 0.0 if abs(low[2]) < 0.3 else low[2]
     rise = min(step, 0.5)
+    ground = 0.0 if abs(low[2]) < 0.3 else np.floor(low[2] / rise) * rise
     return [*lines, np.arange(ground, max(high[2], ground + rise) + 1e-9, rise)]
 
 
