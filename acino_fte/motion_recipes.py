@@ -1,8 +1,8 @@
 """The motions that come with the simulator, as data.
 
 The waves of the limbs were found by least squares: the paw on the ground moves backwards at the speed of
-the animal (so it stands still in the world), lifts and swings forward in between, and the joints stay near
-a natural posture and inside their ranges. Footfall order, stride rate and posture of the gallop follow
+the animal (so that it hardly slips in the world), lifts and swings forward in between, and the joints stay
+near a natural posture, inside their ranges, and as smooth as the process noise of the species has them. Footfall order, stride rate and posture of the gallop follow
 Hildebrand 1959 (Motions of the running cheetah and horse, J. Mammal. 40:481) and Hudson, Corr, Wilson 2012
 (High speed galloping in the cheetah and the racing greyhound, J. Exp. Biol. 215:2425): both hind limbs,
 the extended flight, both forelimbs, the gathered flight with the spine flexed. The joint angles of the
@@ -36,31 +36,19 @@ def _legs(front: dict[str, Wave], back: dict[str, Wave], landing: dict[str, floa
 
 
 _GALLOP_FRONT = {
-    "thigh.shoulder": Wave(
-        41.6, ((1, 48.5, -154.0), (2, 1.0, -19.0), (3, 5.6, -168.0), (4, 2.2, -138.0), (5, 3.3, -157.0))
-    ),
-    "calf.knee": Wave(
-        -68.3, ((1, 44.4, 0.0), (2, 0.5, 154.0), (3, 1.3, -23.0), (4, 5.6, 74.0), (5, 7.9, 39.0))
-    ),
-    "foot.ankle": Wave(
-        15.1, ((1, 38.6, -84.0), (2, 13.5, 90.0), (3, 2.4, -119.0), (4, 2.0, -176.0), (5, 8.2, -125.0))
-    ),
+    "thigh.shoulder": Wave(36.8, ((1, 49.2, -141.0), (2, 7.3, 16.0), (3, 5.9, -157.0), (4, 0.3, 125.0))),
+    "calf.knee": Wave(-64.5, ((1, 39.0, 7.0), (2, 6.5, 151.0), (3, 3.7, -79.0), (4, 3.1, 120.0))),
+    "foot.ankle": Wave(18.9, ((1, 32.8, -83.0), (2, 8.0, 94.0), (3, 1.1, -42.0), (4, 0.2, -68.0))),
 }
 _GALLOP_BACK = {
-    "thigh.hip": Wave(
-        -31.0, ((1, 31.4, -128.0), (2, 8.2, -112.0), (3, 5.6, 28.0), (4, 8.9, 112.0), (5, 1.7, 11.0))
-    ),
-    "calf.knee": Wave(
-        87.1, ((1, 24.4, -73.0), (2, 19.1, 80.0), (3, 22.8, -140.0), (4, 10.3, -26.0), (5, 5.3, -167.0))
-    ),
-    "foot.ankle": Wave(
-        -86.7, ((1, 41.2, 4.0), (2, 16.5, 100.0), (3, 8.9, -171.0), (4, 5.2, -115.0), (5, 4.2, -31.0))
-    ),
+    "thigh.hip": Wave(-26.6, ((1, 45.8, -118.0), (2, 6.0, -15.0), (3, 8.4, 148.0), (4, 2.6, 163.0))),
+    "calf.knee": Wave(98.6, ((1, 13.7, 124.0), (2, 13.2, -71.0), (3, 8.8, -22.0), (4, 1.8, -60.0))),
+    "foot.ankle": Wave(-51.7, ((1, 28.5, 80.0), (2, 11.3, -115.0), (3, 2.0, -25.0), (4, 0.4, 175.0))),
 }
 _FLEXED = 0.86 * 360  # the spine is most flexed in the middle of the gathered flight
 _GALLOP_BODY = {
     "neck.pitch": Wave(-20, ((1, 4, -126),)),
-    "front_torso.pitch": Wave(15, ((1, 9, -_FLEXED), (2, 2, 0))),
+    "front_torso.pitch": Wave(15, ((1, 9, -_FLEXED),)),
     "back_torso.pitch": Wave(-9, ((1, -17, -_FLEXED),)),
     "tail_base.pitch": Wave(12, ((1, 14, -36),)),
     "tail_mid.pitch": Wave(-18, ((1, 14, -108),)),
@@ -68,7 +56,7 @@ _GALLOP_BODY = {
     "tail_mid.yaw": Wave(0, ((0.5, 10, -60),)),
 }
 _GALLOP_ROOT = {
-    "up": Wave(0.80, ((1, 0.02, -108), (2, 0.012, 60))),
+    "up": Wave(0.80, ((1, 0.02, -108),)),
     "pitch": Wave(3, ((1, 3, -216),)),
 }
 _GALLOP_LANDING = {"l_back": 0.0, "r_back": 0.11, "r_front": 0.42, "l_front": 0.55}
@@ -77,7 +65,7 @@ _GALLOP_JOINTS = {**_GALLOP_BODY, **_legs(_GALLOP_FRONT, _GALLOP_BACK, _GALLOP_L
 GALLOP = Recipe(
     name="gallop",
     summary="cheetah, rotary gallop at 13 m/s with a flexing spine",
-    rate=3.4,
+    rate=3.0,
     speed=13.0,
     joints=_GALLOP_JOINTS,
     root=_GALLOP_ROOT,
@@ -87,7 +75,7 @@ GALLOP = Recipe(
 TURN = Recipe(
     name="turn",
     summary="cheetah, gallop at 9 m/s on a curve of 25 m radius, leaning into it",
-    rate=9.0 / 13.0 * 3.4,  # the length of the stride stays
+    rate=9.0 / 13.0 * 3.0,  # the length of the stride stays
     speed=9.0,
     joints={
         **_GALLOP_JOINTS,
@@ -103,14 +91,14 @@ TURN = Recipe(
 )
 
 _TROT_FRONT = {
-    "thigh.shoulder": Wave(22.6, ((1, 25.9, 159.0), (2, 11.7, -142.0), (3, 4.2, 97.0), (4, 0.4, -31.0))),
-    "calf.knee": Wave(-39.2, ((1, 21.3, -72.0), (2, 16.1, 22.0), (3, 9.1, -53.0), (4, 1.7, 136.0))),
-    "foot.ankle": Wave(11.5, ((1, 13.1, -95.0), (2, 2.4, 2.0), (3, 11.2, 122.0), (4, 1.8, -83.0))),
+    "thigh.shoulder": Wave(23.9, ((1, 25.2, 160.0), (2, 11.1, -141.0), (3, 4.0, 93.0))),
+    "calf.knee": Wave(-41.4, ((1, 19.9, -69.0), (2, 15.9, 19.0), (3, 6.2, -52.0))),
+    "foot.ankle": Wave(12.4, ((1, 13.3, -97.0), (2, 0.8, -78.0), (3, 4.0, 120.0))),
 }
 _TROT_BACK = {
-    "thigh.hip": Wave(-25.7, ((1, 26.6, -140.0), (2, 9.7, 2.0), (3, 2.3, 35.0), (4, 0.9, 101.0))),
-    "calf.knee": Wave(76.4, ((1, 11.3, 93.0), (2, 23.2, -148.0), (3, 4.1, 143.0), (4, 3.5, -111.0))),
-    "foot.ankle": Wave(-44.4, ((1, 17.5, 98.0), (2, 1.1, 138.0), (3, 8.1, -58.0), (4, 5.2, 66.0))),
+    "thigh.hip": Wave(-26.1, ((1, 26.7, -140.0), (2, 8.7, -3.0), (3, 2.7, 42.0))),
+    "calf.knee": Wave(77.1, ((1, 11.3, 93.0), (2, 22.4, -148.0), (3, 1.3, 154.0))),
+    "foot.ankle": Wave(-44.3, ((1, 17.7, 96.0), (2, 2.8, 53.0), (3, 3.0, -77.0))),
 }
 _TROT_LANDING = {"l_front": 0.0, "r_back": 0.03, "r_front": 0.5, "l_back": 0.53}
 
