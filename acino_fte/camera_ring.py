@@ -10,7 +10,7 @@ import numpy as np
 from acino_fte.cameras import Camera, CameraArray
 
 CameraModel = Literal["fisheye", "pinhole"]
-Layout = Literal["sides", "ring"]
+Layout = Literal["auto", "sides", "ring"]
 
 RESOLUTION = (2704, 1520)
 # The action cameras of AcinoSet (Joska et al. 2021): focal length, principal point, fisheye coefficients.
@@ -27,7 +27,7 @@ def camera_ring(
     radius: float | None = None,
     height: float | None = None,
     model: CameraModel = "fisheye",
-    layout: Layout = "sides",
+    layout: Layout = "auto",
 ) -> CameraArray:
     """Cameras that look at the path of an animal.
 
@@ -45,7 +45,8 @@ def camera_ring(
     model : str
         ``"fisheye"``, the wide action cameras of AcinoSet, or ``"pinhole"`` without distortion.
     layout : str
-        ``"sides"``: half of them on each side along the path; ``"ring"``: on a circle about it.
+        ``"sides"``: half of them on each side along the path; ``"ring"``: on a circle about it;
+        ``"auto"``: a ring for a path shorter than the distance of the cameras, else the sides.
 
     Returns
     -------
@@ -59,6 +60,8 @@ def camera_ring(
     heading = _heading(middle)
     along = (middle - centre)[:, :2] @ heading
     length = float(np.ptp(along))
+    if layout == "auto":
+        layout = "ring" if length < radius else "sides"
     places = _sides(n_cameras, radius, length) if layout == "sides" else _ring(n_cameras, radius, length)
     cameras = []
     for i, (forward, left) in enumerate(places):

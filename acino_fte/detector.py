@@ -19,8 +19,8 @@ from acino_fte.skeleton import Skeleton
 GRID, GRID_START = 8.0, 4.0  # px: DeepLabCut's stride, and the middle of its first cell
 _BOX = 0.25  # of the size of the animal in the image: margin of the box that outliers fall in
 
-# Beta distributions of the likelihood. A threshold of 0.5 keeps 99.9 % of the good detections, 11 % of the
-# guesses for hidden markers and 60 % of the gross outliers: it knows itself often, not always.
+# Beta distributions of the likelihood. A threshold of 0.5 keeps 99.8 % of the good detections, 11 % of the
+# guesses for hidden markers and 58 % of the gross outliers: it knows itself often, not always.
 LIKELIHOOD = {
     "seen": (9.0, 1.0),
     "swapped": (6.0, 1.5),

@@ -1,13 +1,13 @@
 """The motions that come with the simulator, as data.
 
 The waves of the limbs were found by least squares: the paw on the ground moves backwards at the speed of
-the animal (so that it hardly slips in the world), lifts and swings forward in between, and the joints stay
-near a natural posture, inside their ranges, and as smooth as the process noise of the species has them. Footfall order, stride rate and posture of the gallop follow
-Hildebrand 1959 (Motions of the running cheetah and horse, J. Mammal. 40:481) and Hudson, Corr, Wilson 2012
-(High speed galloping in the cheetah and the racing greyhound, J. Exp. Biol. 215:2425): both hind limbs,
-the extended flight, both forelimbs, the gathered flight with the spine flexed. The joint angles of the
-walk follow the shape of the normal curves in Winter 2009 (Biomechanics and Motor Control of Human
-Movement, 4th ed.).
+the animal (so that it hardly slips in the world), lifts and swings forward in between, and the joints
+stay near a natural posture, inside their ranges, and as smooth as the process noise of the species has
+them. Footfall order, stride rate and posture of the gallop follow Hildebrand 1959 (Motions of the running
+cheetah and horse, J. Mammal. 40:481) and Hudson, Corr, Wilson 2012 (High speed galloping in the cheetah
+and the racing greyhound, J. Exp. Biol. 215:2425): both hind limbs, the extended flight, both forelimbs,
+the gathered flight with the spine flexed. The joint angles of the walk follow the shape of the normal
+curves in Winter 2009 (Biomechanics and Motor Control of Human Movement, 4th ed.).
 
 Angles in degrees, lengths in metres, lags and rates in strides.
 """
@@ -56,7 +56,7 @@ _GALLOP_BODY = {
     "tail_mid.yaw": Wave(0, ((0.5, 10, -60),)),
 }
 _GALLOP_ROOT = {
-    "up": Wave(0.80, ((1, 0.02, -108),)),
+    "up": Wave(0.808, ((1, 0.02, -108),)),
     "pitch": Wave(3, ((1, 3, -216),)),
 }
 _GALLOP_LANDING = {"l_back": 0.0, "r_back": 0.11, "r_front": 0.42, "l_front": 0.55}
@@ -84,7 +84,7 @@ TURN = Recipe(
         "tail_base.yaw": Wave(20, ((0.5, 15, 0),)),
         "tail_mid.yaw": Wave(15, ((0.5, 20, -60),)),
     },
-    root={**_GALLOP_ROOT, "yaw": Wave(5, ((1, 1.5, 0),))},
+    root={**_GALLOP_ROOT, "up": Wave(0.82, ((1, 0.02, -108),)), "yaw": Wave(5, ((1, 1.5, 0),))},
     curvature=1 / 25.0,
     lean=18.3,  # atan(v² / (g·radius))
     needs=_CHEETAH,

@@ -15,12 +15,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.kinematics import Kinematics
 from acino_fte.skeleton import Dof, Skeleton
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 ROOT_MOTIONS = ("forward", "left", "up", "yaw", "pitch", "roll")
 _MARGIN = 0.01  # of a range, kept free at both ends
@@ -241,11 +245,8 @@ def place_root(skeleton: Skeleton, recipe: Recipe, time: np.ndarray, speed: floa
     _write_root(skeleton, path + frame.apply(offset), frame * Rotation.from_euler("ZYX", body), q)
 
 
-def _write_root(skeleton: Skeleton, position: np.ndarray, rotation: object, q: np.ndarray) -> None:
+def _write_root(skeleton: Skeleton, position: np.ndarray, rotation: Rotation, q: np.ndarray) -> None:
     """Express a position (N, 3) and a rotation in the degrees of freedom that the root has."""
-    from scipy.spatial.transform import Rotation
-
-    assert isinstance(rotation, Rotation)
     dofs = [(j, skeleton.dofs[j]) for link in skeleton.links if link.parent < 0 for j in link.dofs]
     for j, dof in dofs:
         if dof.kind == "slide":

@@ -14,17 +14,19 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from acino_fte.camera_ring import CameraModel, Layout, camera_ring
+from acino_fte.camera_ring import CameraModel, Layout, camera_ring, default_radius
 from acino_fte.cameras import CameraArray
 from acino_fte.detector import Detections, Faults, detect
 from acino_fte.errors import InputError
 from acino_fte.kinematics import load_kinematics
-from acino_fte.motions import make_motion
+from acino_fte.motions import find_recipe, make_motion
 from acino_fte.occlusion import hidden_by_body
 from acino_fte.skeleton import Skeleton
 
 if TYPE_CHECKING:
     from acino_fte.sequence import Sequence
+
+_PATH = 3.0  # longest path, in distances of the cameras
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ class SimulationOptions:
     camera_model : str
         ``"fisheye"`` (the action cameras of AcinoSet) or ``"pinhole"``.
     layout : str
-        ``"sides"`` (along both sides of the path) or ``"ring"`` (about it).
+        ``"sides"`` (along both sides of the path), ``"ring"`` (about it) or ``"auto"`` (a ring for a path
+        shorter than the distance of the cameras).
     radius, height : float, optional
         Of the cameras, m; by default in proportion to the animal.
     longest_path : float, optional
@@ -73,13 +76,13 @@ class SimulationOptions:
     fps: float = 120.0
     n_cameras: int = 6
     camera_model: CameraModel = "fisheye"
-    layout: Layout = "sides"
+    layout: Layout = "auto"
     radius: float | None = None
     height: float | None = None
     longest_path: float | None = None
     noise_px: float | Literal["species"] = 2.0
-    missing: float = 0.0
-    outliers: float = 0.0
+    missing: float = 0.1
+    outliers: float = 0.02
     swaps: float = 0.0
     occlusion: bool = True
     occlusion_px: float = 15.0
@@ -101,7 +104,7 @@ class SimulationOptions:
             _check(self, "height", -1e6, 1e6, "metres")
         if self.noise_px != "species":
             _check(self, "noise_px", 0.0, 1e4, "px, at least 0, or 'species'")
-        for key, known in (("camera_model", ("fisheye", "pinhole")), ("layout", ("sides", "ring"))):
+        for key, known in (("camera_model", ("fisheye", "pinhole")), ("layout", ("auto", "sides", "ring"))):
             if getattr(self, key) not in known:
                 raise InputError(
                     f"The simulation option '{key}' is wrong.",
@@ -148,6 +151,26 @@ class Simulation:
     pixels: np.ndarray
     detections: Detections
 
+    @property
+    def notes(self) -> list[str]:
+        """What the user should know about the recording, one sentence each."""
+        options, notes = self.options, []
+        recipe = find_recipe(self.skeleton, options.motion, options.seed)
+        path = recipe.speed * options.n_frames / options.fps
+        longest = _longest_path(self.skeleton, options)
+        if path > longest:
+            notes.append(
+                f"the path would be {path:.0f} m long; the animal moves as on a treadmill over "
+                f"{longest:.0f} m instead, so that the cameras see it (the longest path is an option)"
+            )
+        twice = float(np.mean(self.detections.in_image.sum(axis=1) >= 2))
+        if twice < 0.9:
+            notes.append(
+                f"only {twice:.0%} of the markers are in the images of two cameras or more; "
+                "a larger radius or more cameras would see more"
+            )
+        return notes
+
 
 def simulate(skeleton: Skeleton, options: SimulationOptions | None = None) -> Simulation:
     """Simulate a recording.
@@ -157,7 +180,7 @@ def simulate(skeleton: Skeleton, options: SimulationOptions | None = None) -> Si
     skeleton : Skeleton
         Of any species.
     options : SimulationOptions, optional
-        By default one second of gallop before six cameras without dropouts and outliers.
+        By default one second of gallop before six cameras.
 
     Returns
     -------
@@ -193,21 +216,24 @@ def simulate(skeleton: Skeleton, options: SimulationOptions | None = None) -> Si
 
 def _motion(skeleton: Skeleton, options: SimulationOptions) -> np.ndarray:
     """Degrees of freedom (N, Q), on a treadmill where the path would be too long."""
-    from acino_fte.camera_ring import default_radius
-
-    kinematics = load_kinematics(skeleton)
-    longest = options.longest_path
-    if longest is None:
-        pose = make_motion(kinematics, options.motion, 1, options.fps, seed=options.seed)
-        longest = 3.0 * (options.radius or default_radius(kinematics.positions(pose)))
     return make_motion(
-        kinematics,
+        load_kinematics(skeleton),
         options.motion,
         options.n_frames,
         options.fps,
         seed=options.seed,
-        longest_path=longest,
+        longest_path=_longest_path(skeleton, options),
     )
+
+
+def _longest_path(skeleton: Skeleton, options: SimulationOptions) -> float:
+    if options.longest_path is not None:
+        return options.longest_path
+    if options.radius is not None:
+        return _PATH * options.radius
+    kinematics = load_kinematics(skeleton)
+    pose = make_motion(kinematics, options.motion, 1, options.fps, seed=options.seed)
+    return _PATH * default_radius(kinematics.positions(pose))
 
 
 def _faults(skeleton: Skeleton, options: SimulationOptions) -> Faults:
@@ -223,6 +249,17 @@ def _faults(skeleton: Skeleton, options: SimulationOptions) -> Faults:
         occlusion_px=options.occlusion_px,
         quantise=options.quantise,
         seed=options.seed,
+    )
+
+
+def is_bundled(skeleton: Skeleton) -> bool:
+    """Whether the species comes with the toolkit, so that its name finds it."""
+    from acino_fte.models import species_names, species_path
+
+    if skeleton.path is None:
+        return True
+    return (
+        skeleton.name in species_names() and skeleton.path.resolve() == species_path(skeleton.name).resolve()
     )
 
 
@@ -253,7 +290,7 @@ def simulation_to_sequence(simulation: Simulation, name: str | None = None) -> S
     )
     return Sequence(
         name=name or f"{skeleton.name}_{options.motion}",
-        species=str(skeleton.path) if skeleton.path else skeleton.name,
+        species=skeleton.name if is_bundled(skeleton) else str(skeleton.path),
         fps=float(options.fps),
         detections=detections,
         cameras=simulation.cameras,
