@@ -264,7 +264,10 @@ def is_bundled(skeleton: Skeleton) -> bool:
 
 
 def simulation_to_sequence(simulation: Simulation, name: str | None = None) -> Sequence:
-    """The recording, with its truth, as a reader would give it, in memory."""
+    """The recording, with its truth, as a reader would give it, in memory.
+
+    Like a reader it gives what was not detected a likelihood of zero.
+    """
     import xarray as xr
 
     from acino_fte.sequence import Sequence
@@ -276,10 +279,11 @@ def simulation_to_sequence(simulation: Simulation, name: str | None = None) -> S
         "marker": skeleton.marker_names,
     }
     dims = ("frame", "camera", "marker")
+    found = np.isfinite(simulation.detections.position).all(axis=-1)
     detections = xr.Dataset(
         {
             "position": ((*dims, "space"), simulation.detections.position),
-            "likelihood": (dims, simulation.detections.likelihood),
+            "likelihood": (dims, np.where(found, simulation.detections.likelihood, 0.0)),
         },
         coords={**coordinates, "space": ["u", "v"]},
     )
