@@ -9,7 +9,8 @@ Examples
 >>> sequence = af.load_sequence("examples/cheetah_gallop")       # doctest: +SKIP
 >>> kinematics = af.load_kinematics(af.load_skeleton("cheetah")) # doctest: +SKIP
 >>> problem = af.build_fte(sequence, kinematics)                 # doctest: +SKIP
->>> result = af.solve_fte(problem, af.initialise(sequence, kinematics))  # doctest: +SKIP
+>>> start = af.initial_trajectory(sequence, kinematics)          # doctest: +SKIP
+>>> result = af.solve_fte(problem, start)                        # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _PUBLIC = {
     "FTEOptions": "problem",
     "FTEProblem": "problem",
     "build_fte": "problem",
-    "initialise": "initialise",
+    "initial_trajectory": "initialise",
     "SolveOptions": "solve",
     "solve_fte": "solve",
     "FTEResult": "result",

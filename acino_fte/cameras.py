@@ -261,7 +261,9 @@ class CameraArray(Sequence[Camera]):
     def __post_init__(self) -> None:
         names = self.names
         if len(set(names)) != len(names):
-            raise InputError("Two cameras have one name.", found=", ".join(names), remedy="rename one of them")
+            raise InputError(
+                "Two cameras have one name.", found=", ".join(names), remedy="rename one of them"
+            )
 
     @property
     def names(self) -> list[str]:

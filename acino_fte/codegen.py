@@ -13,6 +13,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from types import CodeType
@@ -61,6 +62,7 @@ class Program:
         exec(compile("\n".join(lines) + "\n", "<acino_fte program>", "exec"), namespace)
         return namespace["program"]
 
+    @cached_property
     def compiled_steps(self) -> list[tuple[str, CodeType]]:
         """The assignments as code objects, for :meth:`run`."""
         return [(name, compile(text, f"<{name}>", "eval")) for name, text in self.steps]
@@ -70,11 +72,10 @@ class Program:
         values: Mapping[str, Any],
         functions: Mapping[str, Callable],
         wrap: Callable[[str, Any], Any] = lambda _, value: value,
-        steps: Sequence[tuple[str, CodeType]] | None = None,
     ) -> list[Any]:
         """Run on any algebra that has operators and the given functions; ``wrap`` sees each step."""
         space: dict[str, Any] = {**functions, **values}
-        for name, code in steps if steps is not None else self.compiled_steps():
+        for name, code in self.compiled_steps:
             space[name] = wrap(name, eval(code, {"__builtins__": {}}, space))
         return [space[o] if o in space else float(o) for o in self.outputs]
 
@@ -217,7 +218,7 @@ def cached_programs(
         digest.update(source.read_bytes() if isinstance(source, Path) else repr(source).encode())
     path = cache_folder() / f"{name}-{digest.hexdigest()[:24]}.json"
     programs = _read(path)
-    if programs is None:
+    if not programs:
         programs = derive()
         _write(path, programs)
     return programs
@@ -232,7 +233,7 @@ def _read(path: Path) -> dict[str, Program] | None:
             )
             for key, p in data.items()
         }
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None  # absent, or cut off: derive again
 
 

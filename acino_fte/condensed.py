@@ -110,13 +110,13 @@ class Condensed:
     Parameters
     ----------
     problem : FTEProblem
-    hessian : str
-        ``"gauss-newton"`` (default; positive semidefinite) or ``"exact"``.
+    exact : bool
+        Use the exact Hessian instead of the Gauss–Newton one, which is positive semidefinite.
     """
 
-    def __init__(self, problem: FTEProblem, hessian: str = "gauss-newton") -> None:
+    def __init__(self, problem: FTEProblem, *, exact: bool = False) -> None:
         self.problem = problem
-        self.exact = hessian == "exact"
+        self.exact = exact
         self.shape = (problem.n_frames, len(problem.lower))
         self.compiled = [_CompiledTerm(t, problem.dt) for t in problem.terms]
         self.compiled = [t for t in self.compiled if t.size]
@@ -124,6 +124,12 @@ class Condensed:
         self._at: np.ndarray | None = None
         self._linear: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._slopes: list[np.ndarray] = []
+
+    def use_exact(self) -> None:
+        """Use the exact Hessian from now on."""
+        if not self.exact:
+            self.exact = True
+            self._at = None
 
     # --- value -------------------------------------------------------------------------------------
 
@@ -352,5 +358,9 @@ class Condensed:
 
     def hessian(self, x: np.ndarray) -> np.ndarray:
         """Entries of the lower triangle in the order of :attr:`structure`."""
-        return np.concatenate([b[lag:, p].ravel() for lag, (b, p) in enumerate(
-            zip(self.hessian_blocks(x), self._patterns, strict=True))])
+        return np.concatenate(
+            [
+                b[lag:, p].ravel()
+                for lag, (b, p) in enumerate(zip(self.hessian_blocks(x), self._patterns, strict=True))
+            ]
+        )

@@ -17,12 +17,14 @@ from acino_fte.solve import SolveOptions, minimise
 from acino_fte.terms import point_term
 from acino_fte.triangulate import triangulate
 
-_POINT_SD = 0.03  # m, spread of triangulated markers about the skeleton: segment lengths are generic
+_POINT_SD = 0.06  # m, spread of triangulated markers about the skeleton: segment lengths are generic
 _ENOUGH = 3e-3  # relative decrease of the objective per iteration below which the start is good enough
 _COARSE = 3  # the start is solved on every third frame and interpolated: it only has to be near
 
 
-def initialise(sequence: Sequence, kinematics: Kinematics, options: FTEOptions | None = None) -> np.ndarray:
+def initial_trajectory(
+    sequence: Sequence, kinematics: Kinematics, options: FTEOptions | None = None
+) -> np.ndarray:
     """Degrees of freedom to start from, (N, Q), within their bounds.
 
     Raises
@@ -130,7 +132,8 @@ def _turn(points: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Turn points (N, M, 3) about the vertical by one angle a frame."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     return np.stack(
-        [c * points[..., 0] - s * points[..., 1], s * points[..., 0] + c * points[..., 1], points[..., 2]], axis=-1
+        [c * points[..., 0] - s * points[..., 1], s * points[..., 0] + c * points[..., 1], points[..., 2]],
+        axis=-1,
     )
 
 

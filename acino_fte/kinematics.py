@@ -35,6 +35,7 @@ from acino_fte.skeleton import Skeleton
 if TYPE_CHECKING:
     import sympy as sp
 
+
 @dataclass(frozen=True)
 class Kinematics:
     """Compiled kinematics of one skeleton. Make it with :func:`load_kinematics`."""

@@ -139,7 +139,9 @@ class Loss:
             for end, program in _programs(self.name)[kind]
         ]
 
-    def _evaluate(self, pieces: list[tuple[float, Callable[..., None]]], e: np.ndarray, rows: int) -> np.ndarray:
+    def _evaluate(
+        self, pieces: list[tuple[float, Callable[..., None]]], e: np.ndarray, rows: int
+    ) -> np.ndarray:
         e = np.abs(np.asarray(e, dtype=float))
         arguments = list(self.parameters.values())
         out = np.empty((rows, *e.shape))
@@ -176,7 +178,9 @@ class Loss:
             psi[far] = bend[far] = weight[far] = 0.0
         return rho, psi, bend, weight
 
-    def expression(self, e: Any, if_else: Callable[[Any, Any, Any], Any], functions: dict[str, Callable]) -> Any:
+    def expression(
+        self, e: Any, if_else: Callable[[Any, Any, Any], Any], functions: dict[str, Callable]
+    ) -> Any:
         """ρ(e) in another algebra; ``if_else(condition, then, otherwise)`` joins the pieces, e ≥ 0."""
         pieces = _programs(self.name)["value"]
         values = [p.run({"e": e, **self.parameters}, functions)[0] for _, p in pieces]

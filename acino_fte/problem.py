@@ -10,7 +10,7 @@ likelihood, so that the curvature at the optimum is an information matrix).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -73,6 +73,9 @@ class FTEProblem:
     terms : tuple of Term
     lower, upper : (Q,)
         Bounds of every frame's q, m and rad.
+    options : FTEOptions
+    sequence : Sequence, optional
+        What the problem was built from.
     """
 
     kinematics: Kinematics
@@ -81,6 +84,8 @@ class FTEProblem:
     terms: tuple[Term, ...]
     lower: np.ndarray
     upper: np.ndarray
+    options: FTEOptions = field(default_factory=FTEOptions)
+    sequence: Sequence | None = None
 
     @property
     def n_frames(self) -> int:
@@ -104,9 +109,7 @@ class FTEProblem:
 
     def with_terms(self, *terms: Term) -> FTEProblem:
         """The same problem with more terms."""
-        return FTEProblem(
-            self.kinematics, self.fps, self.frames, (*self.terms, *terms), self.lower, self.upper
-        )
+        return replace(self, terms=(*self.terms, *terms))
 
 
 def build_problem(
@@ -116,17 +119,15 @@ def build_problem(
     skeleton, n = kinematics.skeleton, len(frames)
     if n > 3:
         model = model_term(skeleton, n, fps)
-        terms = [*terms, Term(**{**vars(model), "sd": model.sd * options.noise_scale})]
+        terms = [*terms, replace(model, sd=model.sd * options.noise_scale)]
     if options.prior_width > 0:
         terms = [*terms, prior_term(skeleton, n, options.prior_width)]
     lower = np.array([d.lower for d in skeleton.dofs])
     upper = np.array([d.upper for d in skeleton.dofs])
-    return FTEProblem(kinematics, fps, np.asarray(frames), tuple(terms), lower, upper)
+    return FTEProblem(kinematics, fps, np.asarray(frames), tuple(terms), lower, upper, options)
 
 
-def build_fte(
-    sequence: Sequence, kinematics: Kinematics, options: FTEOptions | None = None
-) -> FTEProblem:
+def build_fte(sequence: Sequence, kinematics: Kinematics, options: FTEOptions | None = None) -> FTEProblem:
     """State the trajectory problem of a sequence. Pure: solves nothing, reads and writes nothing.
 
     Raises
@@ -149,4 +150,5 @@ def build_fte(
             key="likelihood",
             remedy="lower --likelihood, or choose frames in which the animal is seen",
         )
-    return build_problem(kinematics, sequence.fps, sequence.frames, present, options)
+    problem = build_problem(kinematics, sequence.fps, sequence.frames, present, options)
+    return replace(problem, sequence=sequence)

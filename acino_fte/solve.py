@@ -14,14 +14,12 @@ import numpy as np
 
 from acino_fte.condensed import Condensed
 from acino_fte.errors import InputError
-from acino_fte.kinematics import Kinematics
-from acino_fte.problem import FTEOptions, FTEProblem
+from acino_fte.problem import FTEProblem
 from acino_fte.result import FTEResult, Status
-from acino_fte.sequence import Sequence
 
 Progress = Callable[[int, float], None]
 
-_STATUS = {  # IPOPT's return codes (IpReturnCodes_inc.h)
+IPOPT_STATUS = {  # IPOPT's return codes (IpReturnCodes_inc.h)
     0: Status.CONVERGED,
     1: Status.ACCEPTABLE,
     2: Status.DIVERGED,
@@ -54,7 +52,7 @@ class SolveOptions:
     linear_solver : str
         ``mumps``, or another that the installed IPOPT has.
     hessian : str
-        ``gauss-newton`` or ``exact``.
+        ``auto`` (Gauss–Newton far from the minimum, exact near it), ``gauss-newton`` or ``exact``.
     """
 
     max_iter: int = 500
@@ -63,7 +61,7 @@ class SolveOptions:
     max_seconds: float = 3600.0
     print_level: int = 0
     linear_solver: str = "mumps"
-    hessian: str = "gauss-newton"
+    hessian: str = "auto"
 
     def __post_init__(self) -> None:
         for name, good in (
@@ -71,7 +69,7 @@ class SolveOptions:
             ("tolerance", self.tolerance > 0),
             ("max_seconds", self.max_seconds > 0),
             ("print_level", 0 <= self.print_level <= 12),
-            ("hessian", self.hessian in ("gauss-newton", "exact")),
+            ("hessian", self.hessian in ("auto", "gauss-newton", "exact")),
         ):
             if not good:
                 raise InputError(
@@ -114,8 +112,9 @@ class Minimum:
 class _Callbacks:
     """What IPOPT calls: the condensed problem, progress, and the best iterate so far."""
 
-    def __init__(self, condensed: Condensed, progress: Progress | None, enough: float) -> None:
+    def __init__(self, condensed: Condensed, progress: Progress | None, enough: float, refine: bool) -> None:
         self.condensed = condensed
+        self.refine = refine
         self.progress = progress
         self.enough = enough
         self.stop = False
@@ -147,9 +146,11 @@ class _Callbacks:
         self.iterations = iteration
         if self.progress is not None:
             self.progress(iteration, value)
-        settled = 0 <= self._last - value < self.enough * abs(value)
+        gain = (self._last - value) / abs(value) if value else 0.0
         self._last = value
-        return not (self.stop or settled)
+        if self.refine and 0 <= gain < _NEAR:
+            self.condensed.use_exact()
+        return not (self.stop or 0 <= gain < self.enough)
 
 
 def minimise(
@@ -167,8 +168,8 @@ def minimise(
     import cyipopt
 
     options = options or SolveOptions()
-    condensed = Condensed(problem, options.hessian)
-    callbacks = _Callbacks(condensed, progress, enough)
+    condensed = Condensed(problem, exact=options.hessian == "exact")
+    callbacks = _Callbacks(condensed, progress, enough, refine=options.hessian == "auto" and not enough)
     n = problem.n_frames
     start = problem.clip(start)
     solver = cyipopt.Problem(
@@ -182,7 +183,7 @@ def minimise(
         solver.add_option(name, value)
     with _stop_on_interrupt(callbacks):
         x, info = solver.solve(start.ravel())
-    status = _STATUS.get(info["status"], Status.FAILED)
+    status = IPOPT_STATUS.get(info["status"], Status.FAILED)
     value = float(info["obj_val"])
     if not status.ok and callbacks.best[0] < np.inf:
         value, x = callbacks.best
@@ -190,6 +191,10 @@ def minimise(
         status, np.clip(x.reshape(start.shape), problem.lower, problem.upper), value, callbacks.iterations
     )
 
+
+# Relative decrease per iteration below which the exact Hessian takes over. Residuals are large where the
+# skeleton does not fit the animal, and Gauss–Newton steps then only crawl to the minimum.
+_NEAR = 1e-5
 
 _STRATEGY: dict[str, str | float | int] = {
     "mu_strategy": "adaptive",
@@ -221,8 +226,6 @@ def _stop_on_interrupt(callbacks: _Callbacks) -> Iterator[None]:
 def solve_fte(
     problem: FTEProblem,
     start: np.ndarray,
-    sequence: Sequence,
-    fte_options: FTEOptions | None = None,
     options: SolveOptions | None = None,
     *,
     lowering: str = "condensed",
@@ -234,19 +237,25 @@ def solve_fte(
     Parameters
     ----------
     problem : FTEProblem
+        From :func:`acino_fte.problem.build_fte`.
     start : (N, Q)
-    sequence : Sequence
-        The one the problem was built from.
-    fte_options, options
-        Options of the problem (for the record, and for its likelihood threshold) and of the solver.
+        From :func:`acino_fte.initialise.initial_trajectory`.
+    options : SolveOptions, optional
     lowering : str
         ``"condensed"`` or ``"explicit"``.
     progress : callable, optional
         Called with (iteration, objective).
     seconds : dict, optional
-        Time spent so far by stage.
+        Time spent so far by stage, for the record.
+
+    Raises
+    ------
+    InputError
+        An unknown lowering, or a problem that was not built from a sequence.
     """
-    fte_options, options = fte_options or FTEOptions(), options or SolveOptions()
+    if problem.sequence is None:
+        raise InputError("The problem holds no sequence.", remedy="make it with build_fte")
+    options = options or SolveOptions()
     began = time.perf_counter()
     if lowering == "condensed":
         minimum = minimise(problem, start, options, progress)
@@ -255,37 +264,34 @@ def solve_fte(
 
         minimum = minimise_explicit(problem, start, options, progress)
     else:
-        raise InputError(f"There is no lowering '{lowering}'.", expected="'condensed' or 'explicit'")
-    spent = {**(seconds or {}), "solve": time.perf_counter() - began}
-    return _result(problem, minimum, sequence, fte_options, options, lowering, spent)
-
-
-def _result(
-    problem: FTEProblem,
-    minimum: Minimum,
-    sequence: Sequence,
-    fte_options: FTEOptions,
-    options: SolveOptions,
-    lowering: str,
-    seconds: dict[str, float],
-) -> FTEResult:
-    kinematics: Kinematics = problem.kinematics
-    positions = kinematics.positions(minimum.q)
-    velocity = np.gradient(minimum.q, problem.dt, axis=0) if problem.n_frames > 1 else 0 * minimum.q
-    acceleration = np.gradient(velocity, problem.dt, axis=0) if problem.n_frames > 1 else 0 * minimum.q
+        raise InputError(
+            f"There is no lowering '{lowering}'.", key="lowering", expected="'condensed' or 'explicit'"
+        )
+    positions = problem.kinematics.positions(minimum.q)
+    velocity = _rate(minimum.q, problem.dt)
     return FTEResult(
         status=minimum.status,
-        sequence=sequence,
-        skeleton=kinematics.skeleton,
+        sequence=problem.sequence,
+        skeleton=problem.kinematics.skeleton,
         q=minimum.q,
         dq=velocity,
-        ddq=acceleration,
+        ddq=_rate(velocity, problem.dt),
         positions=positions,
-        observed=sequence.pixels(kinematics.skeleton.marker_names, fte_options.likelihood),
-        reprojected=sequence.cameras.project(positions),
+        observed=problem.sequence.pixels(
+            problem.kinematics.skeleton.marker_names, problem.options.likelihood
+        ),
+        reprojected=problem.sequence.cameras.project(positions),
         objective=minimum.objective,
         iterations=minimum.iterations,
         method=f"fte-{lowering}",
-        seconds=seconds,
-        options={"problem": fte_options.summary(), "solver": options.summary()},
+        seconds={**(seconds or {}), "solve": time.perf_counter() - began},
+        options={"problem": problem.options.summary(), "solver": options.summary()},
     )
+
+
+def _rate(values: np.ndarray, dt: float) -> np.ndarray:
+    """Backward difference in time (N, Q); the first row repeats the second."""
+    if len(values) < 2:
+        return np.zeros_like(values)
+    rate = np.diff(values, axis=0) / dt
+    return np.concatenate([rate[:1], rate])

@@ -254,7 +254,9 @@ class _Chain:
         n = len(variables)
         self.pairs = [(i, j) for i in range(n) for j in range(i + 1)]
         self._first = {y: [sp.Integer(int(i == k)) for i in range(n)] for k, y in enumerate(variables)}
-        self._second: dict[sp.Symbol, list[sp.Expr]] = {y: [sp.Integer(0)] * len(self.pairs) for y in variables}
+        self._second: dict[sp.Symbol, list[sp.Expr]] = {
+            y: [sp.Integer(0)] * len(self.pairs) for y in variables
+        }
 
     def let(self, name: str, expression: sp.Expr) -> sp.Expr:
         """Name an intermediate result and keep its derivatives."""
@@ -322,9 +324,7 @@ def measurement_residual(model: str) -> Residual:
     return Residual(f"{model}", (Handle("position"),), data, ("u", "v"), "px", derive, source)
 
 
-def _jump(
-    handles: list[Any], _: dict[str, sp.Symbol], _let: Let
-) -> tuple[list[sp.Expr], list[sp.Expr]]:
+def _jump(handles: list[Any], _: dict[str, sp.Symbol], _let: Let) -> tuple[list[sp.Expr], list[sp.Expr]]:
     now, before = handles
     return [now - before], []
 

@@ -75,7 +75,11 @@ def triangulate(cameras: CameraArray, pixels: np.ndarray, threshold_px: float = 
         part = todo[start : start + _CHUNK]
         pose = part // m if moves else slice(None)
         views = _Views(
-            seen[part], np.where(seen[part, :, None], observed[part], 0.0), focal, rotation[pose], translation[pose]
+            seen[part],
+            np.where(seen[part, :, None], observed[part], 0.0),
+            focal,
+            rotation[pose],
+            translation[pose],
         )
         points[part], inliers[part], errors[part] = _solve(views, threshold_px)
     return Triangulation(

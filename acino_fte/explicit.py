@@ -1,0 +1,217 @@
+"""The explicit lowering: the same problem as a Pyomo model that reads like the thesis.
+
+Variables, indexed by frame number, ``link.dof``, marker and camera name:
+
+    x, dx, ddx[frame, dof]            state and its derivatives
+    position[frame, marker, axis]     marker positions, m
+    slack_model[frame, dof, 'w']      jump of acceleration
+    slack_meas[frame, marker, camera, 'u' | 'v']      reprojection residual, px
+    slack_<family>[…]                 residuals of any other term
+
+Constraints: ``kinematics`` (position = p(x)), ``velocity`` and ``acceleration`` (backward Euler), and
+``residual_<family>`` (slack = residual). The objective is Σ ρ(slack/σ). Only what was observed has a slack.
+(Joska et al. 2021, eq. 4–9.)
+
+Adding a constraint takes two lines; a paw never below the ground::
+
+    model = build_explicit(problem, start)
+    model.ground = pyo.Constraint(model.FRAMES, rule=lambda m, f: m.position[f, "l_front_paw", "z"] >= 0)
+    minimum = solve_explicit(model, problem)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyomo.environ as pyo
+from pyomo.core.expr import Expr_if
+
+from acino_fte.codegen import FUNCTIONS
+from acino_fte.problem import FTEProblem
+from acino_fte.terms import Handle, Term, input_names, residual_program
+
+AXES = ("x", "y", "z")
+_PYOMO: dict[str, Callable] = {f: getattr(pyo, f) for f in FUNCTIONS if hasattr(pyo, f)}
+
+
+def build_explicit(problem: FTEProblem, start: np.ndarray) -> pyo.ConcreteModel:
+    """State a problem as a Pyomo model, initialised at q (N, Q). Nothing is solved."""
+    model = pyo.ConcreteModel("full trajectory estimation")
+    skeleton = problem.kinematics.skeleton
+    model.FRAMES = pyo.Set(initialize=[int(f) for f in problem.frames], ordered=True)
+    model.DOFS = pyo.Set(initialize=skeleton.dof_names, ordered=True)
+    model.MARKERS = pyo.Set(initialize=skeleton.marker_names, ordered=True)
+    model.AXES = pyo.Set(initialize=AXES, ordered=True)
+    point = _Point.at(problem, start)
+    _add_states(model, problem, point)
+    _add_kinematics(model, problem, point)
+    model.cost = pyo.Expression(pyo.Any)
+    by_family: dict[str, list[Term]] = {}
+    for term in problem.terms:
+        by_family.setdefault(term.family, []).append(term)
+    for family, terms in by_family.items():
+        _add_terms(model, problem, family, terms, point)
+    model.objective = pyo.Objective(expr=pyo.quicksum(model.cost.values()), sense=pyo.minimize)
+    return model
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Numbers that the model starts from: states (N, Q) and positions (N, M, 3)."""
+
+    x: np.ndarray
+    dx: np.ndarray
+    ddx: np.ndarray
+    position: np.ndarray
+
+    @classmethod
+    def at(cls, problem: FTEProblem, start: np.ndarray) -> _Point:
+        """Derivatives by backward differences; those of the first frames continue what follows."""
+        x = problem.clip(start)
+        dx = np.diff(x, axis=0, prepend=x[:1]) / problem.dt
+        ddx = np.diff(dx, axis=0, prepend=dx[:1]) / problem.dt
+        if len(x) > 2:
+            ddx[:2] = ddx[2]
+            dx[0] = dx[1] - problem.dt * ddx[1]
+        return cls(x, dx, ddx, problem.kinematics.positions(x))
+
+    def residuals(self, problem: FTEProblem, term: Term) -> np.ndarray:
+        """Residuals of a term at this point, (components, K)."""
+        inputs: list[np.ndarray | float] = []
+        for handle in term.residual.handles:
+            source = {"dof": self.x, "velocity": self.dx, "acceleration": self.ddx, "position": self.position}
+            value = source[handle.kind][term.frames - handle.lag, term.items[:, handle.item]]
+            inputs += list(value.T) if handle.kind == "position" else [value]
+        inputs += [problem.dt, *(term.data[name] for name in term.residual.data)]
+        out = np.empty((len(term.residual.components), len(term)))
+        residual_program(term.residual).numpy_function()(inputs, out)
+        return out
+
+
+def _add_states(model: pyo.ConcreteModel, problem: FTEProblem, point: _Point) -> None:
+    """x, dx, ddx and the backward differences between them."""
+    frames, dofs, dt = list(model.FRAMES), list(model.DOFS), problem.dt
+    finite = [
+        (None if np.isinf(lo) else lo, None if np.isinf(up) else up)
+        for lo, up in zip(problem.lower, problem.upper, strict=True)
+    ]
+    bounds = dict(zip(dofs, finite, strict=True))
+
+    def table(values: np.ndarray) -> dict[tuple[int, str], float]:
+        return {(f, d): float(values[n, j]) for n, f in enumerate(frames) for j, d in enumerate(dofs)}
+
+    model.x = pyo.Var(model.FRAMES, model.DOFS, bounds=lambda m, f, d: bounds[d], initialize=table(point.x))
+    model.dx = pyo.Var(model.FRAMES, model.DOFS, initialize=table(point.dx))
+    model.ddx = pyo.Var(model.FRAMES, model.DOFS, initialize=table(point.ddx))
+
+    def backward(lower: pyo.Var, higher: pyo.Var) -> Callable:
+        def rule(m: pyo.ConcreteModel, f: int, d: str) -> Any:
+            if f == m.FRAMES.first():
+                return pyo.Constraint.Skip
+            return lower[f, d] == lower[m.FRAMES.prev(f), d] + dt * higher[f, d]
+
+        return rule
+
+    model.velocity = pyo.Constraint(model.FRAMES, model.DOFS, rule=backward(model.x, model.dx))
+    model.acceleration = pyo.Constraint(model.FRAMES, model.DOFS, rule=backward(model.dx, model.ddx))
+
+
+def _add_kinematics(model: pyo.ConcreteModel, problem: FTEProblem, point: _Point) -> None:
+    """position = p(x), with every shared sub-expression a named Expression."""
+    program = problem.kinematics.position_program
+    dofs, markers = list(model.DOFS), list(model.MARKERS)
+    model.position = pyo.Var(model.FRAMES, model.MARKERS, model.AXES)
+    model.shared = pyo.Expression(pyo.Any)
+    model.kinematics = pyo.Constraint(model.FRAMES, model.MARKERS, model.AXES)
+    for n, f in enumerate(model.FRAMES):
+        values = {f"q_{j}": model.x[f, d] for j, d in enumerate(dofs)}
+        results = program.run(values, _PYOMO, _Named(model.shared, f))
+        for i, result in enumerate(results):
+            key = (f, markers[i // 3], AXES[i % 3])
+            model.kinematics[key] = model.position[key] == result
+            model.position[key].set_value(float(point.position[n].flat[i]))
+
+
+class _Named:
+    """Turns each step of a program into a named Expression of the model."""
+
+    def __init__(self, into: pyo.Expression, *key: Any) -> None:
+        self.into, self.key = into, key
+
+    def __call__(self, name: str, value: Any) -> Any:
+        if isinstance(value, (int, float)):
+            return value
+        key = (*self.key, name)
+        self.into[key] = value
+        return self.into[key]
+
+
+def _add_terms(
+    model: pyo.ConcreteModel, problem: FTEProblem, family: str, terms: list[Term], point: _Point
+) -> None:
+    """Slacks, their defining constraints and their cost, for all terms of one family."""
+    slack = pyo.Var(pyo.Any, dense=False)
+    constraint = pyo.Constraint(pyo.Any)
+    model.add_component(f"slack_{family}", slack)
+    model.add_component(f"residual_{family}", constraint)
+    for term in terms:
+        program = residual_program(term.residual)
+        values_now = point.residuals(problem, term)
+        for k, (key, values) in enumerate(_instances(model, problem, term)):
+            named = _Named(model.shared, family, *key)
+            residuals = program.run(values, _PYOMO, named)
+            sd = float(term.sd[k])
+            for c, (component, residual) in enumerate(zip(term.residual.components, residuals, strict=True)):
+                index = (*key, component)
+                slack[index].set_value(float(values_now[c, k]))
+                constraint[index] = slack[index] == residual
+                e = slack[index] / sd
+                if term.loss.name != "squared":
+                    e = abs(e)
+                model.cost[(family, *index)] = term.loss.expression(e, _if_else, _PYOMO)
+
+
+def _if_else(condition: Any, then: Any, otherwise: Any) -> Any:
+    return Expr_if(condition, then, otherwise)
+
+
+def _instances(
+    model: pyo.ConcreteModel, problem: FTEProblem, term: Term
+) -> Iterator[tuple[tuple, dict[str, Any]]]:
+    """Index and input values of every instance of a term."""
+    frames = list(model.FRAMES)
+    names = input_names(term.residual)
+    n_data = 1 + len(term.residual.data)
+    for k in range(len(term)):
+        n, items = int(term.frames[k]), term.items[k]
+        inputs: list[Any] = []
+        for handle in term.residual.handles:
+            inputs += _handle_values(model, handle, frames[n - handle.lag], int(items[handle.item]))
+        data = [term.data[name] for name in term.residual.data]
+        inputs += [problem.dt, *(float(v[k]) if isinstance(v, np.ndarray) else v for v in data)]
+        labels = [_label(model, term, int(i)) for i in items]
+        key = (frames[n], *labels, *([term.label] if term.label else []))
+        assert len(inputs) == len(names) >= n_data
+        yield key, dict(zip(names, inputs, strict=True))
+
+
+def _label(model: pyo.ConcreteModel, term: Term, item: int) -> str:
+    kind = term.residual.handles[0].kind
+    return str((model.MARKERS if kind == "position" else model.DOFS).at(item + 1))
+
+
+def _handle_values(model: pyo.ConcreteModel, handle: Handle, frame: int, item: int) -> list[Any]:
+    """The model's variables behind a handle."""
+    if handle.kind == "position":
+        marker = model.MARKERS.at(item + 1)
+        return [model.position[frame, marker, a] for a in AXES]
+    variable = {"dof": model.x, "velocity": model.dx, "acceleration": model.ddx}[handle.kind]
+    return [variable[frame, model.DOFS.at(item + 1)]]
+
+
+def read_states(model: pyo.ConcreteModel) -> np.ndarray:
+    """x of a solved model as q (N, Q)."""
+    return np.array([[pyo.value(model.x[f, d]) for d in model.DOFS] for f in model.FRAMES])
