@@ -20,7 +20,6 @@ from pathlib import Path
 
 from acino_fte.data_tools.calibration import read_cameras
 from acino_fte.data_tools.sequence_file import FILE_NAME, SequenceFile
-
 from acino_fte.errors import InputError
 
 KEYPOINTS = "dlc"

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from acino_fte.data_tools.keypoints import Keypoints
 
 from acino_fte.cameras import CameraArray
+from acino_fte.data_tools.keypoints import Keypoints
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from acino_fte.data_tools.keypoints import COORDINATES, Keypoints, from_table
 
+from acino_fte.data_tools.keypoints import COORDINATES, Keypoints, from_table
 from acino_fte.errors import InputError
 
 H5_SUFFIXES = (".h5", ".hdf5", ".hdf")

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from acino_fte.data_tools.deeplabcut import single_animal
 from acino_fte.data_tools.safe_pickle import load_data_pickle
-
 from acino_fte.errors import InputError
 
 _KEY = "df_with_missing"

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from acino_fte.cameras import CameraArray
 from acino_fte.data_tools import checks
 from acino_fte.data_tools.acinoset import is_acinoset, understand_acinoset
 from acino_fte.data_tools.calibration import read_cameras
@@ -15,8 +17,6 @@ from acino_fte.data_tools.matching import match_markers, match_warnings
 from acino_fte.data_tools.pairing import check_pairing
 from acino_fte.data_tools.sequence_file import FILE_NAME, SequenceFile, read_sequence_file
 from acino_fte.data_tools.truth import read_truth
-
-from acino_fte.cameras import CameraArray
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton, load_skeleton

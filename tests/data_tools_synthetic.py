@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from acino_fte.cameras import Camera, CameraArray
 from acino_fte.data_tools.calibration import write_cameras
 from acino_fte.data_tools.deeplabcut import write_deeplabcut_csv
 from acino_fte.data_tools.sequence_file import write_sequence_file
-
-from acino_fte.cameras import Camera, CameraArray
 from acino_fte.errors import InputError
 from acino_fte.skeleton import load_skeleton
 

@@ -4,11 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from acino_fte.data_tools.calibration import read_cameras, write_cameras
 from data_tools_synthetic import LILY, message, needs_lily, ring, write_scene
 from scipy.spatial.transform import Rotation
 
 from acino_fte.cameras import Camera, CameraArray
+from acino_fte.data_tools.calibration import read_cameras, write_cameras
 
 
 def same(a, b, tolerance=0.0):

@@ -6,9 +6,10 @@ import h5py
 import numpy as np
 import pandas as pd
 import pytest
+from data_tools_synthetic import LILY, message, needs_lily
+
 from acino_fte.data_tools.deeplabcut import read_deeplabcut, write_deeplabcut_csv
 from acino_fte.data_tools.safe_pickle import load_data_pickle
-from data_tools_synthetic import LILY, message, needs_lily
 
 NAMES = ["nose", "tail base", "l_eye"]
 HEADER = "scorer,net,net,net\nbodyparts,nose,nose,nose\ncoords,x,y,likelihood\n"

@@ -6,11 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from acino_fte.data_tools.calibration import write_cameras
-from acino_fte.data_tools.deeplabcut import write_deeplabcut_csv
-from acino_fte.data_tools.load import load_sequence
-from acino_fte.data_tools.sequence_file import SequenceFile, read_sequence_file, write_sequence_file
-from acino_fte.data_tools.truth import read_truth, write_truth
 from data_tools_synthetic import (
     LILY,
     MARKERS,
@@ -26,6 +21,11 @@ from data_tools_synthetic import (
 )
 
 from acino_fte.cameras import Camera, CameraArray
+from acino_fte.data_tools.calibration import write_cameras
+from acino_fte.data_tools.deeplabcut import write_deeplabcut_csv
+from acino_fte.data_tools.load import load_sequence
+from acino_fte.data_tools.sequence_file import SequenceFile, read_sequence_file, write_sequence_file
+from acino_fte.data_tools.truth import read_truth, write_truth
 from acino_fte.skeleton import load_skeleton
 
 GIVEN = {"species": "cheetah", "fps": 120.0}

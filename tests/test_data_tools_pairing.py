@@ -7,12 +7,12 @@ from time import perf_counter
 import numpy as np
 import pytest
 import xarray as xr
-from acino_fte.data_tools.load import load_sequence
-from acino_fte.data_tools.pairing import check_pairing
 from data_tools_synthetic import LILY, cloud, needs_lily, pixels, ring, write_recording
 from scipy.spatial.transform import Rotation
 
 from acino_fte.cameras import CameraArray
+from acino_fte.data_tools.load import load_sequence
+from acino_fte.data_tools.pairing import check_pairing
 
 
 def dataset(position):

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from acino_fte.models import species_names
 
 from acino_fte.errors import InputError
 from acino_fte.kinematics import load_kinematics
+from acino_fte.models import species_names
 from acino_fte.motion_recipes import GALLOP, RECIPES
 from acino_fte.motions import Recipe, Wave, fit_to_range, make_motion, motion_names
 from acino_fte.simulate import SimulationOptions, simulate

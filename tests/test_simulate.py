@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from acino_fte.data_tools.load import load_sequence
-from acino_fte.models import species_path
 from typer.testing import CliRunner
 
+from acino_fte.data_tools.load import load_sequence
 from acino_fte.errors import InputError
 from acino_fte.kinematics import load_kinematics
+from acino_fte.models import species_path
 from acino_fte.simulate import SimulationOptions, simulate, simulation_to_sequence
 from acino_fte.simulation_files import write_simulation
 from acino_fte.skeleton import load_skeleton

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 import yaml
-from acino_fte.data_tools.deeplabcut import write_deeplabcut_csv
 
 from acino_fte import models
+from acino_fte.data_tools.deeplabcut import write_deeplabcut_csv
 from acino_fte.errors import InputError
 from acino_fte.observability import observability
 from acino_fte.skeleton import expand, load_skeleton

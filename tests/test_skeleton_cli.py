@@ -138,6 +138,7 @@ def test_warnings_leave_with_0() -> None:
 
 def test_check_against_keypoints() -> None:
     import numpy as np
+
     from acino_fte.data_tools.deeplabcut import write_deeplabcut_csv
 
     names = ["nose", "left_eye", "lure"]
