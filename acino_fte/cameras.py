@@ -23,7 +23,7 @@ _COUNTS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (4,)}
 
 @cache
 def _compiled(model: str) -> dict[str, Callable[..., None]]:
-    return {name: program.numpy_function() for name, program in programs(model).items()}
+    return {name: program.numpy_function for name, program in programs(model).items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +93,11 @@ class Camera:
         """The camera for a range of frames; a fixed camera is returned as it is."""
         if not self.moves:
             return self
-        pose = {
-            "rotation": self.rotation[frames] if self.rotation.ndim == 3 else self.rotation,
-            "translation": self.translation[frames] if self.translation.ndim == 2 else self.translation,
-        }
-        return replace(self, **pose)
+        return replace(
+            self,
+            rotation=self.rotation[frames] if self.rotation.ndim == 3 else self.rotation,
+            translation=self.translation[frames] if self.translation.ndim == 2 else self.translation,
+        )
 
     def to_camera(self, points: np.ndarray) -> np.ndarray:
         """World points (N, M, 3) in the camera's frame; for a fixed camera any leading shape will do."""
@@ -276,7 +276,7 @@ class CameraArray(Sequence[Camera]):
     def __iter__(self) -> Iterator[Camera]:
         return iter(self.cameras)
 
-    def __getitem__(self, key):  # type: ignore[no-untyped-def]
+    def __getitem__(self, key):
         """A camera by index or by name."""
         if isinstance(key, str):
             return self.cameras[self.names.index(key)]

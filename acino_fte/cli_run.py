@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -184,6 +185,7 @@ def _estimate(
     seconds: dict[str, float] = {}
     with _stages(seconds, quiet) as stage:
         with stage("load", "reading"):
+            import_module("cyipopt")  # a second of importing that should not count as solving
             loaded = load_sequence(
                 path, species=species, fps=fps, frames=frames, likelihood=options.likelihood
             )
@@ -238,8 +240,8 @@ def _describe(sequence: Sequence, result: FTEResult) -> None:
     error = metrics["reprojection_px"]
     spent = metrics["seconds"]
     stdout.print(
-        f"{escape(sequence.name)}: {result.skeleton.name}, {sequence.n_frames} frames at {sequence.fps:g} Hz, "
-        f"{len(sequence.cameras)} cameras, {metrics['n_observations']} detections"
+        f"{escape(sequence.name)}: {result.skeleton.name}, {sequence.n_frames} frames at "
+        f"{sequence.fps:g} Hz, {len(sequence.cameras)} cameras, {metrics['n_observations']} detections"
     )
     colour = "green" if result.status.ok else "yellow"
     stdout.print(
@@ -249,7 +251,8 @@ def _describe(sequence: Sequence, result: FTEResult) -> None:
     )
     if error["median"] is not None:
         stdout.print(
-            f"reprojection error: median {error['median']:.1f} px, {100 * error['within_20px']:.1f} % within 20 px"
+            f"reprojection error: median {error['median']:.1f} px, "
+            f"{100 * error['within_20px']:.1f} % within 20 px"
         )
     truth = metrics.get("truth_mm")
     if truth:

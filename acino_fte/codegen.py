@@ -47,8 +47,9 @@ class Program:
     steps: tuple[tuple[str, str], ...]
     outputs: tuple[str, ...]
 
+    @cached_property
     def numpy_function(self) -> Callable[..., None]:
-        """Compile to a function ``f(a, out)`` on arrays.
+        """The program as a function ``f(a, out)`` on arrays, compiled once.
 
         Input i is read from ``a[i]`` and result i is written to ``out[i]``; both index the leading
         axis, so rows may be arrays of any one shape. Constants are written too.

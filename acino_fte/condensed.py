@@ -13,14 +13,13 @@ block size Q): cost and memory grow linearly with N.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from acino_fte.problem import FTEProblem
-from acino_fte.terms import Lowered, Term, lower
+from acino_fte.terms import Term, lower
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,6 @@ class _CompiledTerm:
             rows = slice(start, start + width)
             self.slots.append(_Slot(kind, lag, frames - lag, items[:, item], rows))
             start += width
-        self._functions: dict[str, Callable[..., None]] = {}
 
     @property
     def quadratic(self) -> bool:
@@ -76,11 +74,9 @@ class _CompiledTerm:
                 inputs += list(positions[slot.frames, slot.items].T)
             else:
                 inputs.append(q[slot.frames, slot.items])
-        if program not in self._functions:
-            self._functions[program] = self.lowered.programs[program].numpy_function()
         out = np.empty((len(self.lowered.programs[program].outputs), self.size))
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            self._functions[program]([*inputs, *self.data], out)
+            self.lowered.programs[program].numpy_function([*inputs, *self.data], out)
         return out
 
     def normalised(self, out: np.ndarray) -> np.ndarray:
@@ -229,7 +225,9 @@ class Condensed:
                 for second in term.slots:
                     if second.lag < first.lag:
                         continue
-                    for row, column in np.unique(np.stack([first.items, second.items], axis=1), axis=0):
+                    met = np.zeros((first.items.max() + 1, second.items.max() + 1), dtype=bool)
+                    met[first.items, second.items] = True
+                    for row, column in np.argwhere(met):
                         patterns[second.lag - first.lag] |= np.outer(
                             depends[row] if first.kind == "position" else np.arange(d) == row,
                             depends[column] if second.kind == "position" else np.arange(d) == column,

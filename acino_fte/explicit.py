@@ -87,7 +87,7 @@ class _Point:
             inputs += list(value.T) if handle.kind == "position" else [value]
         inputs += [problem.dt, *(term.data[name] for name in term.residual.data)]
         out = np.empty((len(term.residual.components), len(term)))
-        residual_program(term.residual).numpy_function()(inputs, out)
+        residual_program(term.residual).numpy_function(inputs, out)
         return out
 
 

@@ -34,39 +34,36 @@ def initial_trajectory(
     """
     options = options or FTEOptions()
     pixels = sequence.pixels(kinematics.skeleton.marker_names, options.likelihood)
-    points = triangulate(sequence.cameras, pixels).points
-    if not np.isfinite(points).any():
+    for stride in (_COARSE, 1) if sequence.n_frames >= 8 * _COARSE else (1,):
+        some = slice(None, None, stride)
+        cameras = sequence.cameras.at_frames(some)
+        points = triangulate(cameras, pixels[some]).points
+        if np.isfinite(points).any():
+            break
+    else:
         raise InputError(
             f"No marker of sequence '{sequence.name}' is seen by two cameras at once with rays that meet.",
             expected=f"likelihood above {options.likelihood:g} in two of {', '.join(sequence.cameras.names)}",
             remedy="lower --likelihood, choose other frames, or check that each keypoint file belongs to "
             "its camera",
         )
-    start = pose_start(kinematics, points)
-    return smooth_inverse_kinematics(kinematics, points, start, sequence.fps, sequence.frames, options)
+    q = smooth_inverse_kinematics(
+        kinematics, points, sequence.fps / stride, sequence.frames[some], options
+    )
+    if stride > 1:
+        q = CubicSpline(np.arange(0, sequence.n_frames, stride), q, axis=0)(np.arange(sequence.n_frames))
+    dofs = kinematics.skeleton.dofs
+    return np.clip(q, [d.lower for d in dofs], [d.upper for d in dofs])
 
 
 def smooth_inverse_kinematics(
-    kinematics: Kinematics,
-    points: np.ndarray,
-    start: np.ndarray,
-    fps: float,
-    frames: np.ndarray,
-    options: FTEOptions | None = None,
+    kinematics: Kinematics, points: np.ndarray, fps: float, frames: np.ndarray, options: FTEOptions
 ) -> np.ndarray:
-    """Fit q (N, Q) to marker positions (N, M, 3), NaN where unknown, under the motion model."""
-    options = options or FTEOptions()
-    stride = _COARSE if len(points) >= 8 * _COARSE else 1
-    chosen = np.unique(np.r_[np.arange(0, len(points), stride), len(points) - 1])
-    if chosen[-1] - chosen[-2] < stride:  # keep the spacing even; the last frames are extrapolated
-        chosen = chosen[:-1]
-    term = point_term(points[chosen], _POINT_SD, Loss("cauchy", {"c": 2.0}))
-    problem = build_problem(kinematics, fps / stride, frames[chosen], [term], options)
+    """Fit q (N, Q) to marker positions (N, M, 3), m, NaN where unknown, under the motion model."""
+    term = point_term(points, _POINT_SD, Loss("cauchy", {"c": 2.0}))
+    problem = build_problem(kinematics, fps, frames, [term], options)
     settings = SolveOptions(max_iter=60, tolerance=1.0, acceptable_tolerance=10.0)
-    q = minimise(problem, start[chosen], settings, enough=_ENOUGH).q
-    if stride > 1:
-        q = CubicSpline(chosen, q, axis=0)(np.arange(len(points)))
-    return problem.clip(q)
+    return minimise(problem, pose_start(kinematics, points), settings, enough=_ENOUGH).q
 
 
 def pose_start(kinematics: Kinematics, points: np.ndarray) -> np.ndarray:

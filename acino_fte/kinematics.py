@@ -56,11 +56,11 @@ class Kinematics:
 
     @cached_property
     def _positions(self) -> Callable[..., None]:
-        return self.position_program.numpy_function()
+        return self.position_program.numpy_function
 
     @cached_property
     def _twists(self) -> Callable[..., None]:
-        return self.twist_program.numpy_function()
+        return self.twist_program.numpy_function
 
     @cached_property
     def depends(self) -> np.ndarray:
@@ -93,6 +93,7 @@ class Kinematics:
         Parameters
         ----------
         q : (N, Q)
+            Degrees of freedom, m and rad.
 
         Returns
         -------

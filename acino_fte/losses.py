@@ -135,7 +135,7 @@ class Loss:
 
     def _compile(self, kind: str) -> list[tuple[float, Callable[..., None]]]:
         return [
-            (self.parameters[end] if end else np.inf, program.numpy_function())
+            (self.parameters[end] if end else np.inf, program.numpy_function)
             for end, program in _programs(self.name)[kind]
         ]
 

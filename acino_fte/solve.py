@@ -241,6 +241,7 @@ def solve_fte(
     start : (N, Q)
         From :func:`acino_fte.initialise.initial_trajectory`.
     options : SolveOptions, optional
+        The defaults suit almost everything.
     lowering : str
         ``"condensed"`` or ``"explicit"``.
     progress : callable, optional

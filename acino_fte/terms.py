@@ -354,14 +354,7 @@ def measurement_term(
 ) -> Term | None:
     """Reprojection of every observed marker in one camera; None when it saw nothing.
 
-    Parameters
-    ----------
-    camera : Camera
-    pixels : (N, M, 2)
-        Detections, px, NaN where missing.
-    sd_px : (M,)
-    loss : Loss
-    n_frames : int
+    ``pixels`` (N, M, 2) are detections, NaN where missing; ``sd_px`` (M,) their standard deviations.
     """
     frames, markers = np.nonzero(np.isfinite(pixels).all(-1))
     if not len(frames):

@@ -56,6 +56,7 @@ def triangulate(cameras: CameraArray, pixels: np.ndarray, threshold_px: float = 
     Parameters
     ----------
     cameras : CameraArray
+        Fixed or moving.
     pixels : (N, C, M, 2)
         Detections, NaN where missing.
     threshold_px : float

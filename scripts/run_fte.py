@@ -1,4 +1,4 @@
-"""Estimate the 3D trajectory of an animal: ``python scripts/run_fte.py SEQUENCE`` (same as ``acino-fte run``)."""
+"""Estimate the 3D trajectory of an animal: ``python scripts/run_fte.py SEQUENCE``, as ``acino-fte run``."""
 
 import typer
 
