@@ -19,7 +19,8 @@ from functools import cached_property
 import numpy as np
 
 from acino_fte.problem import FTEProblem
-from acino_fte.terms import Term, lower
+from acino_fte.residuals import lower
+from acino_fte.terms import Term
 
 
 @dataclass(frozen=True)
@@ -36,22 +37,20 @@ class _Slot:
 class _CompiledTerm:
     """A term ready to be evaluated: programs compiled, instances that reach before frame 0 dropped.
 
-    Velocities and accelerations of the first frames are free, so a residual that needs frames before the
-    first can always be made zero by them (see :mod:`acino_fte.explicit`) and leaves the problem with them.
+    Velocities and accelerations of the first frames are free: the jumps of acceleration that need frames
+    before the first are made zero by them (see :mod:`acino_fte.explicit`) and leave the problem with them.
     """
 
     def __init__(self, term: Term, dt: float) -> None:
         lowered = lower(term.residual)
-        reach = max(lag for _, lag, _ in lowered.inputs)
-        keep = term.frames >= reach
+        term = term.select(term.frames >= term.residual.reach)
         self.term, self.lowered = term, lowered
         self.n_components = len(term.residual.components)
         self.n_guards = len(lowered.programs["value"].outputs) - self.n_components
-        frames, items = term.frames[keep], term.items[keep]
-        data = [v[keep] if isinstance(v, np.ndarray) else v for v in _columns(term)]
-        self.data = [dt, *data]
-        self.sd = term.sd[keep]
-        self.size = len(frames)
+        frames, items = term.frames, term.items
+        self.data = [dt, *(term.data[name] for name in term.residual.data)]
+        self.sd = term.sd
+        self.size = len(term)
         self.slots: list[_Slot] = []
         start = 0
         for kind, lag, item in lowered.inputs:
@@ -86,10 +85,6 @@ class _CompiledTerm:
         if self.n_guards:
             e[:, (guards <= 0).any(0)] = np.inf
         return e
-
-
-def _columns(term: Term) -> list[float | np.ndarray]:
-    return [term.data[name] for name in term.residual.data]
 
 
 @dataclass

@@ -30,10 +30,11 @@ import pyomo.environ as pyo
 from pyomo.core.expr import Expr_if
 
 from acino_fte.codegen import FUNCTIONS
+from acino_fte.errors import InputError
 from acino_fte.problem import FTEProblem
-from acino_fte.terms import Handle, Term, input_names, residual_program
+from acino_fte.residuals import AXES, Handle, input_names, residual_program
+from acino_fte.terms import Term
 
-AXES = ("x", "y", "z")
 _PYOMO: dict[str, Callable] = {f: getattr(pyo, f) for f in FUNCTIONS if hasattr(pyo, f)}
 
 
@@ -158,6 +159,8 @@ def _add_terms(
     model.add_component(f"slack_{family}", slack)
     model.add_component(f"residual_{family}", constraint)
     for term in terms:
+        if family != "model":  # whose jumps at the first frames settle dx and ddx there
+            term = term.select(term.frames >= term.residual.reach)
         program = residual_program(term.residual)
         values_now = point.residuals(problem, term)
         for k, (key, values) in enumerate(_instances(model, problem, term)):
@@ -166,6 +169,12 @@ def _add_terms(
             sd = float(term.sd[k])
             for c, (component, residual) in enumerate(zip(term.residual.components, residuals, strict=True)):
                 index = (*key, component)
+                if index in constraint:
+                    raise InputError(
+                        f"Two residuals of the family '{family}' have one index.",
+                        found=", ".join(map(str, index)),
+                        remedy="give their terms different labels or families",
+                    )
                 slack[index].set_value(float(values_now[c, k]))
                 constraint[index] = slack[index] == residual
                 e = slack[index] / sd
@@ -184,7 +193,7 @@ def _instances(
     """Index and input values of every instance of a term."""
     frames = list(model.FRAMES)
     names = input_names(term.residual)
-    n_data = 1 + len(term.residual.data)
+    kinds = {handle.item: handle.kind for handle in term.residual.handles}
     for k in range(len(term)):
         n, items = int(term.frames[k]), term.items[k]
         inputs: list[Any] = []
@@ -192,15 +201,12 @@ def _instances(
             inputs += _handle_values(model, handle, frames[n - handle.lag], int(items[handle.item]))
         data = [term.data[name] for name in term.residual.data]
         inputs += [problem.dt, *(float(v[k]) if isinstance(v, np.ndarray) else v for v in data)]
-        labels = [_label(model, term, int(i)) for i in items]
+        labels = [
+            (model.MARKERS if kinds[i] == "position" else model.DOFS).at(int(item) + 1)
+            for i, item in enumerate(items)
+        ]
         key = (frames[n], *labels, *([term.label] if term.label else []))
-        assert len(inputs) == len(names) >= n_data
         yield key, dict(zip(names, inputs, strict=True))
-
-
-def _label(model: pyo.ConcreteModel, term: Term, item: int) -> str:
-    kind = term.residual.handles[0].kind
-    return str((model.MARKERS if kind == "position" else model.DOFS).at(item + 1))
 
 
 def _handle_values(model: pyo.ConcreteModel, handle: Handle, frame: int, item: int) -> list[Any]:

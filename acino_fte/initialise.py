@@ -47,9 +47,7 @@ def initial_trajectory(
             remedy="lower --likelihood, choose other frames, or check that each keypoint file belongs to "
             "its camera",
         )
-    q = smooth_inverse_kinematics(
-        kinematics, points, sequence.fps / stride, sequence.frames[some], options
-    )
+    q = smooth_inverse_kinematics(kinematics, points, sequence.fps / stride, sequence.frames[some], options)
     if stride > 1:
         q = CubicSpline(np.arange(0, sequence.n_frames, stride), q, axis=0)(np.arange(sequence.n_frames))
     dofs = kinematics.skeleton.dofs
