@@ -80,6 +80,11 @@ class Residual:
     def __hash__(self) -> int:
         return hash((self.name, self.handles, self.data))
 
+    @property
+    def reach(self) -> int:
+        """How many frames back the formula needs q."""
+        return max(lag for handle in self.handles for (_, lag, _), _ in _stencil(handle))
+
 
 @dataclass(frozen=True)
 class Lowered:

@@ -1,0 +1,142 @@
+"""What the tests of the core share: a small animal, cameras about it, and random problems."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+from acino_fte.cameras import Camera, CameraArray
+from acino_fte.kinematics import Kinematics, load_kinematics
+from acino_fte.losses import Loss
+from acino_fte.problem import FTEOptions, FTEProblem, build_problem
+from acino_fte.skeleton import Skeleton, expand, load_skeleton
+from acino_fte.species_file import SpeciesFile
+from acino_fte.terms import measurement_term
+
+settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+settings.load_profile("repeatable")
+
+FPS = 100.0
+FISHEYE = (0.037, 0.048, -0.038, 0.011)
+PINHOLE = (-0.12, 0.05, 0.001, -0.0007, 0.01)
+LIZARD = {
+    "format": "acino-fte/skeleton/1",
+    "name": "lizard",
+    "noise_fps": FPS,
+    "links": {
+        "trunk": {
+            "parent": "world",
+            "dofs": {
+                "x": {"slide": "x", "noise": 4},
+                "y": {"slide": "y", "noise": 4},
+                "z": {"slide": "z", "noise": 4},
+                "yaw": {"turn": "z", "noise": 900},
+                "pitch": {"turn": "y", "range": [-60, 60], "noise": 900},
+            },
+        },
+        "tail": {
+            "parent": "trunk",
+            "at": [-0.5, 0, 0],
+            "dofs": {
+                "yaw": {"turn": "z", "range": [-70, 70], "noise": 2000},
+                "pitch": {"turn": "y", "range": [-50, 80], "noise": 2000},
+            },
+        },
+        "l_leg": {
+            "parent": "trunk",
+            "at": [-0.05, 0.12, -0.02],
+            "mirror": "r_leg",
+            "dofs": {"flex": {"turn": "y", "range": [-80, 80], "noise": 3000}},
+        },
+    },
+    "markers": {
+        "nose": {"link": "trunk", "at": [0.2, 0, 0.05], "sd_px": 2},
+        "crest": {"link": "trunk", "at": [-0.3, 0, 0.1], "sd_px": 3},
+        "tail_mid": {"link": "tail", "at": [-0.25, 0, 0], "sd_px": 3},
+        "tail_tip": {"link": "tail", "at": [-0.45, 0.02, 0.03], "sd_px": 4},
+        "l_foot": {"link": "l_leg", "at": [0.02, 0.01, -0.3], "sd_px": 3, "mirror": "r_foot"},
+    },
+}
+
+
+@pytest.fixture(scope="session")
+def lizard() -> Kinematics:
+    """Nine degrees of freedom, six markers."""
+    return load_kinematics(expand(SpeciesFile.model_validate(LIZARD)))
+
+
+@pytest.fixture(scope="session")
+def cheetah() -> Kinematics:
+    return load_kinematics(load_skeleton("cheetah"))
+
+
+def look_at(name, place, target, model="pinhole", distortion=None, focal=900.0) -> Camera:
+    """A level camera at a place (or a path of places, (N, 3)) with the target in the middle."""
+    place, target = np.asarray(place, dtype=float), np.asarray(target, dtype=float)
+    forward = target - place
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    rotation = np.stack([right, np.cross(forward, right), forward], axis=-2)
+    if distortion is None:
+        distortion = FISHEYE if model == "fisheye" else PINHOLE
+    matrix = np.array([[focal, 0, 640.0], [0, focal * 1.01, 360.0], [0, 0, 1]])
+    translation = -np.einsum("...ij,...j->...i", rotation, place)
+    return Camera(name, model, matrix, np.array(distortion), rotation, translation, (1280, 720))
+
+
+def cameras_about(n_frames=1, moving=False, n=4, target=(0.0, 0.0, 0.0), radius=3.0) -> CameraArray:
+    """Pinhole and fisheye cameras in turn, around a target; the first one moves when asked to."""
+    cameras = []
+    for i in range(n):
+        angle = 2 * np.pi * (i + 0.3) / n
+        place = np.array(target) + [radius * np.cos(angle), radius * np.sin(angle), 0.8 + 0.2 * i]
+        if moving and i == 0:
+            place = place + np.linspace(0, 0.4, n_frames)[:, None] * [1.0, -0.5, 0.2]
+        cameras.append(look_at(f"c{i}", place, target, ("pinhole", "fisheye")[i % 2]))
+    return CameraArray(tuple(cameras))
+
+
+def random_motion(skeleton: Skeleton, n_frames: int, seed: int) -> np.ndarray:
+    """Smooth degrees of freedom (N, Q) well inside their ranges; free ones stay near zero."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0, 1, n_frames)[:, None]
+    middle = np.array([d.middle for d in skeleton.dofs])
+    half = np.array(
+        [0.5 * (d.upper - d.lower) if np.isfinite(d.upper - d.lower) else 0.5 for d in skeleton.dofs]
+    )
+    phase = rng.uniform(0, 2 * np.pi, len(middle))
+    return middle + 0.5 * half * np.sin(2.0 * time + phase)
+
+
+def random_problem(
+    kinematics: Kinematics,
+    n_frames: int = 6,
+    loss: Loss | None = None,
+    moving: bool = False,
+    seed: int = 0,
+    noise_px: float = 3.0,
+    outliers: float = 0.1,
+) -> tuple[FTEProblem, np.ndarray]:
+    """A small trajectory problem and its true q (N, Q)."""
+    rng = np.random.default_rng(seed)
+    skeleton = kinematics.skeleton
+    q = random_motion(skeleton, n_frames, seed)
+    cameras = cameras_about(n_frames, moving)
+    pixels = cameras.project(kinematics.positions(q))
+    pixels += rng.normal(0, noise_px, pixels.shape)
+    wild = rng.random(pixels.shape[:3]) < outliers
+    pixels[wild] += rng.normal(0, 80, (wild.sum(), 2))
+    pixels[rng.random(pixels.shape[:3]) < 0.2] = np.nan
+    options = FTEOptions(loss=loss or Loss())
+    sd = np.array([m.sd_px for m in skeleton.markers])
+    terms = [measurement_term(c, pixels[:, i], sd, options.loss, n_frames) for i, c in enumerate(cameras)]
+    frames = np.arange(20, 20 + n_frames)
+    return build_problem(kinematics, FPS, frames, [t for t in terms if t is not None], options), q
+
+
+def unlimited(problem: FTEProblem) -> FTEProblem:
+    """The problem without bounds."""
+    inf = np.full(len(problem.lower), np.inf)
+    return replace(problem, lower=-inf, upper=inf)
