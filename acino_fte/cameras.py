@@ -126,7 +126,7 @@ class Camera:
         x, y, z = np.moveaxis(local, -1, 0)
         z = np.where(z > 0, z, np.nan)
         out = np.empty((n_out, *z.shape))
-        with np.errstate(invalid="ignore", over="ignore"):
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             _compiled(self.model)[program]([x, y, z, *self.parameters], out)
         out[:, np.isnan(z)] = np.nan  # results that do not depend on z
         return out
@@ -248,6 +248,14 @@ def _check_camera(camera: Camera) -> None:
     k = camera.matrix
     if not (k[0, 0] > 0 and k[1, 1] > 0):
         fail("camera matrix", "positive focal lengths at [0][0] and [1][1]", f"{k[0, 0]:g} and {k[1, 1]:g}")
+    if k[1, 0] != 0 or not np.array_equal(k[2], [0, 0, 1]):
+        found = "; ".join(" ".join(f"{v:g}" for v in row) for row in k[1:])
+        fail(
+            "camera matrix",
+            "0 at [1][0] and [0, 0, 1] as its last row",
+            f"last rows {found}",
+            "the matrix may be transposed or scaled",
+        )
     if abs(k[0, 1]) > 1e-6 * k[0, 0]:
         fail("camera matrix", "no skew: [0][1] is 0", f"{k[0, 1]:g}", "calibrate without skew")
 

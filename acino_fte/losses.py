@@ -112,7 +112,7 @@ class Loss:
         unknown = set(self.parameters) - set(DEFAULTS[self.name])
         values = {**DEFAULTS[self.name], **self.parameters}
         ordered = list(values.values())
-        if unknown or any(v <= 0 for v in ordered) or ordered != sorted(set(ordered)):
+        if unknown or not all(0 < v < np.inf for v in ordered) or ordered != sorted(set(ordered)):
             raise InputError(
                 f"The parameters of the loss '{self.name}' are wrong.",
                 expected=f"positive and rising: {', '.join(DEFAULTS[self.name]) or 'none'}",
