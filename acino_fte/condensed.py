@@ -23,6 +23,10 @@ from acino_fte.residuals import lower
 from acino_fte.terms import Term
 
 
+_CHUNK = 2048  # instances evaluated together: a program's intermediate rows stay in the cache
+_FRAMES = 128  # frames whose Jacobians are multiplied together, for the same reason
+
+
 @dataclass(frozen=True)
 class _Slot:
     """One variable group of a term: where its values come from and where its derivatives go."""
@@ -70,12 +74,16 @@ class _CompiledTerm:
         inputs: list[np.ndarray | float] = []
         for slot in self.slots:
             if slot.kind == "position":
-                inputs += list(positions[slot.frames, slot.items].T)
+                inputs += list(np.ascontiguousarray(positions[slot.frames, slot.items].T))
             else:
                 inputs.append(q[slot.frames, slot.items])
+        inputs += self.data
+        function = self.lowered.programs[program].numpy_function
         out = np.empty((len(self.lowered.programs[program].outputs), self.size))
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            self.lowered.programs[program].numpy_function([*inputs, *self.data], out)
+            for start in range(0, self.size, _CHUNK):
+                part = slice(start, start + _CHUNK)
+                function([v[part] if isinstance(v, np.ndarray) else v for v in inputs], out[:, part])
         return out
 
     def normalised(self, out: np.ndarray) -> np.ndarray:
@@ -272,10 +280,13 @@ class Condensed:
             for a in range(3):
                 for b in range(a):
                     inner[:, b, a] = inner[:, a, b]
-            jacobian = self._linear[1]
-            carried = inner.reshape(n, m, 3, 3) @ jacobian
-            flat = jacobian.reshape(n, 3 * m, d)
-            blocks[0] += flat.transpose(0, 2, 1) @ carried.reshape(n, 3 * m, d)
+            inner = inner.reshape(n, m, 3, 3)
+            for start in range(0, n, _FRAMES):
+                part = slice(start, start + _FRAMES)
+                jacobian = self._linear[1][part]
+                flat = jacobian.reshape(-1, 3 * m, d)
+                carried = (inner[part] @ jacobian).reshape(-1, 3 * m, d)
+                blocks[0][part] += flat.transpose(0, 2, 1) @ carried
         if self.exact and self._linear is not None:
             blocks[0] += self._kinematic_curvature()
         return [*blocks, *self._constant_blocks[self._varying_lags :]]

@@ -35,6 +35,8 @@ from acino_fte.skeleton import Skeleton
 if TYPE_CHECKING:
     import sympy as sp
 
+_CHUNK = 256  # frames linearised together: the intermediate rows stay in the processor's cache
+
 
 @dataclass(frozen=True)
 class Kinematics:
@@ -105,24 +107,33 @@ class Kinematics:
         """
         q = np.asarray(q, dtype=float)
         n, m, d = len(q), self.n_markers, self.n_dofs
+        positions, jacobian = np.empty((n, m, 3)), np.empty((n, m, 3, d))
+        axes = np.empty((n, d, 3))
+        for start in range(0, n, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            self._linearise(q[part], positions[part], jacobian[part], axes[part])
+        return positions, jacobian, axes
+
+    def _linearise(
+        self, q: np.ndarray, positions: np.ndarray, jacobian: np.ndarray, axes: np.ndarray
+    ) -> None:
+        """:meth:`linearise` for some frames, into the given arrays."""
+        n, m, d = len(q), self.n_markers, self.n_dofs
         out = np.empty((3 * m + 6 * d, n))
         self._twists(np.ascontiguousarray(q.T), out)
         rows = np.ascontiguousarray(out.T)
+        positions[...] = rows[:, : 3 * m].reshape(n, m, 3)
         omega, moment = rows[:, 3 * m :].reshape(n, 2, d, 3).transpose(1, 0, 3, 2)  # (N, 3, Q) each
+        axes[...] = omega.transpose(0, 2, 1)
         homogeneous = np.ones((n, m, 4))
-        homogeneous[:, :, :3] = rows[:, : 3 * m].reshape(n, m, 3)
+        homogeneous[:, :, :3] = positions
         matrix = np.zeros((n, 4, 3, d))  # [p; 1] ↦ ω × p + u, for every degree of freedom
         for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             matrix[:, c, a] = omega[:, b]
             matrix[:, b, a] = -omega[:, c]
         matrix[:, 3] = moment
-        jacobian = (homogeneous @ matrix.reshape(n, 4, 3 * d)).reshape(n, m, 3, d)
+        np.matmul(homogeneous, matrix.reshape(n, 4, 3 * d), out=jacobian.reshape(n, m, 3 * d))
         jacobian *= self._mask
-        return (
-            np.ascontiguousarray(homogeneous[:, :, :3]),
-            jacobian,
-            np.ascontiguousarray(omega.transpose(0, 2, 1)),
-        )
 
     @cached_property
     def _mask(self) -> np.ndarray:

@@ -148,7 +148,7 @@ class _Callbacks:
             self.progress(iteration, value)
         gain = (self._last - value) / abs(value) if value else 0.0
         self._last = value
-        if self.refine and 0 <= gain < _NEAR:
+        if self.refine and iteration >= _PATIENCE and 0 <= gain < _NEAR:
             self.condensed.use_exact()
         return not (self.stop or 0 <= gain < self.enough)
 
@@ -195,12 +195,14 @@ def minimise(
 # Relative decrease per iteration below which the exact Hessian takes over. Residuals are large where the
 # skeleton does not fit the animal, and Gauss–Newton steps then only crawl to the minimum.
 _NEAR = 1e-5
+_PATIENCE = 8  # iterations: where the skeleton fits, Gauss–Newton is done by then
 
 _STRATEGY: dict[str, str | float | int] = {
     "mu_strategy": "adaptive",
     "mu_min": 1e-5,  # a joint at its limit costs the objective no more than this
     "bound_push": 1e-2,
     "bound_frac": 1e-2,
+    "mumps_mem_percent": 50,  # enough without delayed pivots; IPOPT enlarges it when it is not
     "mumps_permuting_scaling": 0,  # the Hessian is positive semidefinite and well scaled as it is
     "mumps_scaling": 0,
 }
