@@ -22,7 +22,6 @@ from acino_fte.problem import FTEProblem
 from acino_fte.residuals import lower
 from acino_fte.terms import Term
 
-
 _CHUNK = 2048  # instances evaluated together: a program's intermediate rows stay in the cache
 _FRAMES = 128  # frames whose Jacobians are multiplied together, for the same reason
 

@@ -163,7 +163,8 @@ def minimise(
     """Minimise a problem from q (N, Q) by its condensed lowering.
 
     Ctrl-C ends it with the best iterate so far and the status ``interrupted``. ``enough`` stops it early
-    once an iteration lowers the objective by less than this fraction: for a start, not for a result.
+    once an iteration lowers the objective by less than this fraction: for a start, not for a result, so
+    that Ctrl-C then raises KeyboardInterrupt.
     """
     import cyipopt
 
@@ -183,6 +184,8 @@ def minimise(
         solver.add_option(name, value)
     with _stop_on_interrupt(callbacks):
         x, info = solver.solve(start.ravel())
+    if callbacks.stop and enough:
+        raise KeyboardInterrupt  # a start that was cut off is nothing to keep
     status = IPOPT_STATUS.get(info["status"], Status.FAILED)
     value = float(info["obj_val"])
     if not status.ok and callbacks.best[0] < np.inf:
