@@ -33,6 +33,9 @@ IPOPT_STATUS = {  # IPOPT's return codes (IpReturnCodes_inc.h)
 }
 
 
+LINEAR_SOLVERS = ("mumps", "ma27", "ma57", "ma77", "ma86", "ma97", "pardiso")
+
+
 @dataclass(frozen=True)
 class SolveOptions:
     """Options of the solver, the same for both lowerings.
@@ -69,12 +72,14 @@ class SolveOptions:
             ("tolerance", self.tolerance > 0),
             ("max_seconds", self.max_seconds > 0),
             ("print_level", 0 <= self.print_level <= 12),
+            ("linear_solver", self.linear_solver in LINEAR_SOLVERS),
             ("hessian", self.hessian in ("auto", "gauss-newton", "exact")),
         ):
             if not good:
                 raise InputError(
                     f"The solver option {name} cannot be {getattr(self, name)!r}.",
                     key=name,
+                    expected=f"one of {', '.join(LINEAR_SOLVERS)}" if name == "linear_solver" else None,
                     remedy="see --help",
                 )
 
@@ -187,6 +192,12 @@ def minimise(
     if callbacks.stop and enough:
         raise KeyboardInterrupt  # a start that was cut off is nothing to keep
     status = IPOPT_STATUS.get(info["status"], Status.FAILED)
+    if status is Status.FAILED and not callbacks.iterations and options.linear_solver != "mumps":
+        raise InputError(
+            f"IPOPT could not load the linear solver '{options.linear_solver}'.",
+            key="linear_solver",
+            remedy="use 'mumps', which comes with IPOPT, or install that solver's library",
+        )
     value = float(info["obj_val"])
     if not status.ok and callbacks.best[0] < np.inf:
         value, x = callbacks.best
