@@ -18,8 +18,9 @@ from acino_fte.data_tools.pairing import check_pairing
 from acino_fte.data_tools.sequence_file import FILE_NAME, SequenceFile, read_sequence_file
 from acino_fte.data_tools.truth import read_truth
 from acino_fte.errors import InputError, did_you_mean
+from acino_fte.models import species_names
 from acino_fte.sequence import Sequence
-from acino_fte.skeleton import Skeleton, load_skeleton
+from acino_fte.skeleton import Skeleton, load_skeleton, species_file_path
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -133,8 +134,8 @@ def _override(
     """The sequence file with the arguments in place of its values; species and frame rate are then known."""
     update: dict[str, object] = {}
     if species is not None:
-        is_file = Path(species).suffix in (".yaml", ".yml") or Path(species).is_file()
-        update["species"] = str(Path(species).resolve()) if is_file else str(species)
+        bundled = str(species) in species_names()
+        update["species"] = str(species) if bundled else str(species_file_path(species).resolve())
     if fps is not None:
         if not (np.isfinite(fps) and fps > 0):
             raise InputError(
