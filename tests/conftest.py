@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import settings
 
 from acino_fte.cameras import Camera, CameraArray
 from acino_fte.kinematics import Kinematics, load_kinematics
 from acino_fte.losses import Loss
 from acino_fte.problem import FTEOptions, FTEProblem, build_problem
+from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton, expand, load_skeleton
 from acino_fte.species_file import SpeciesFile
 from acino_fte.terms import measurement_term
@@ -134,6 +136,35 @@ def random_problem(
     terms = [measurement_term(c, pixels[:, i], sd, options.loss, n_frames) for i, c in enumerate(cameras)]
     frames = np.arange(20, 20 + n_frames)
     return build_problem(kinematics, FPS, frames, [t for t in terms if t is not None], options), q
+
+
+def make_sequence(
+    kinematics: Kinematics,
+    q: np.ndarray,
+    cameras: CameraArray,
+    noise_px: float = 1.0,
+    fps: float = FPS,
+    seed: int = 0,
+    pixels: np.ndarray | None = None,
+) -> Sequence:
+    """What cameras would have seen of q (N, Q), with its truth; or the given pixels (N, C, M, 2)."""
+    positions = kinematics.positions(q)
+    if pixels is None:
+        pixels = cameras.project(positions)
+        pixels = pixels + np.random.default_rng(seed).normal(0, noise_px, pixels.shape)
+    dims = ("frame", "camera", "marker")
+    names = kinematics.skeleton.marker_names
+    found = np.isfinite(pixels).all(-1)
+    detections = xr.Dataset(
+        {"position": ((*dims, "space"), pixels), "likelihood": (dims, np.where(found, 0.95, 0.0))},
+        {"frame": np.arange(len(q)), "camera": cameras.names, "marker": names, "space": ["u", "v"]},
+    )
+    truth = xr.DataArray(
+        positions,
+        dims=("frame", "marker", "space"),
+        coords={"frame": np.arange(len(q)), "marker": names, "space": ["x", "y", "z"]},
+    )
+    return Sequence(kinematics.skeleton.name, kinematics.skeleton.name, fps, detections, cameras, truth)
 
 
 def unlimited(problem: FTEProblem) -> FTEProblem:
