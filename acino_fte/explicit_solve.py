@@ -6,6 +6,10 @@ installed; else a walk over the Pyomo expressions into CasADi, whose wheel bring
 
 from __future__ import annotations
 
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -104,13 +108,14 @@ def _solve_casadi(
     settings: dict[str, Any] = {f"ipopt.{k}": v for k, v in options.ipopt().items()}
     settings |= {"print_time": False, "ipopt.hessian_approximation": "exact"}
     solver = ca.nlpsol("fte", "ipopt", {"x": x, "f": objective, "g": ca.vertcat(*bodies)}, settings)
-    solution = solver(
-        x0=[_or(v.value, 0.0) for v in variables],
-        lbx=[_or(v.lb, -np.inf) for v in variables],
-        ubx=[_or(v.ub, np.inf) for v in variables],
-        lbg=[_or(pyo.value(c.lower), -np.inf) for c in constraints],
-        ubg=[_or(pyo.value(c.upper), np.inf) for c in constraints],
-    )
+    with _watch_interrupt() as interrupted:
+        solution = solver(
+            x0=[_or(v.value, 0.0) for v in variables],
+            lbx=[_or(v.lb, -np.inf) for v in variables],
+            ubx=[_or(v.ub, np.inf) for v in variables],
+            lbg=[_or(pyo.value(c.lower), -np.inf) for c in constraints],
+            ubg=[_or(pyo.value(c.upper), np.inf) for c in constraints],
+        )
     for variable, value in zip(variables, np.array(solution["x"]).ravel(), strict=True):
         variable.set_value(float(value), skip_validation=True)
     stats = solver.stats()
@@ -118,7 +123,27 @@ def _solve_casadi(
     iterations = int(stats.get("iter_count", 0))
     if progress is not None:
         progress(iterations, float(solution["f"]))
-    return IPOPT_STATUS.get(code, Status.FAILED), iterations
+    status = Status.INTERRUPTED if interrupted else IPOPT_STATUS.get(code, Status.FAILED)
+    return status, iterations
+
+
+@contextmanager
+def _watch_interrupt() -> Iterator[list[int]]:
+    """Remember Ctrl-C: CasADi ends the solve on the KeyboardInterrupt, but tells it as an error of IPOPT."""
+    seen: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield seen
+        return
+
+    def stop(number: int, _frame: object) -> None:
+        seen.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield seen
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _or(value: float | None, other: float) -> float:

@@ -1,6 +1,9 @@
 """The explicit lowering: its model, the same optimum as condensed, constraints of one's own."""
 
+import os
 import random
+import signal
+import threading
 import time
 from dataclasses import replace
 
@@ -210,6 +213,29 @@ def test_out_of_iterations_and_progress(lizard):
     assert minimum.status is Status.MAX_ITERATIONS
     assert minimum.iterations == 1
     assert calls
+
+
+def test_interrupt_is_an_interrupt(lizard, monkeypatch):
+    """Ctrl-C in the middle of CasADi's solve, which by itself reports it as a failure."""
+    problem, q = random_problem(lizard, n_frames=30, seed=5)
+    model = build_explicit(problem, problem.clip(q + np.random.default_rng(0).normal(0, 0.5, q.shape)))
+    original = casadi.nlpsol
+
+    def nlpsol(*arguments):
+        solver = original(*arguments)
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+        return solver
+
+    monkeypatch.setattr(casadi, "nlpsol", nlpsol)
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # should it come too late
+    try:
+        endless = SolveOptions(max_iter=1_000_000, tolerance=1e-15, acceptable_tolerance=1e-15)
+        minimum = solve_explicit(model, problem, endless, route="casadi")
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert minimum.status is Status.INTERRUPTED
+    assert np.isfinite(minimum.q).all()
 
 
 def test_an_unknown_route(lizard):
