@@ -8,6 +8,7 @@ import pytest
 from conftest import FISHEYE, PINHOLE, cameras_about, look_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from acino_fte.cameras import Camera, CameraArray
 from acino_fte.errors import InputError
@@ -57,7 +58,8 @@ def points_in_view(camera, seed, n=20):
 
 
 def opencv_project(camera, world):
-    vector = cv2.Rodrigues(camera.rotation)[0]
+    # not cv2.Rodrigues, which takes rotations below a microradian for none at all
+    vector = Rotation.from_matrix(camera.rotation).as_rotvec().reshape(3, 1)
     points = np.ascontiguousarray(world.reshape(-1, 1, 3))
     if camera.model == "fisheye":
         pixels, _ = cv2.fisheye.projectPoints(
