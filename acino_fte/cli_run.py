@@ -178,9 +178,11 @@ def _estimate(
     from acino_fte.initialise import initial_trajectory
     from acino_fte.kinematics import load_kinematics
     from acino_fte.problem import build_fte
+    from acino_fte.residuals import lower
     from acino_fte.result_files import check_output_folder
     from acino_fte.skeleton import load_skeleton
     from acino_fte.solve import solve_fte
+    from acino_fte.terms import measurement_residual
 
     seconds: dict[str, float] = {}
     with _stages(seconds, quiet) as stage:
@@ -191,6 +193,8 @@ def _estimate(
             )
             target = check_output_folder(out or Path("out") / loaded.name, input_folder=path)
             kinematics = load_kinematics(load_skeleton(loaded.species))
+            for model in {camera.model for camera in loaded.cameras}:
+                lower(measurement_residual(model))  # derived now, the first time, and not while solving
         for message in loaded.warnings:
             warn(message)
         with stage("initialise", "triangulating"):
@@ -265,7 +269,15 @@ def _save(result: FTEResult, target: Path, source: Path, figures: bool, quiet: b
     from acino_fte.result_files import save_result
 
     with stderr.status("drawing figures") if on_terminal() and not quiet else _nothing():
-        save_result(result, target, figures=figures, input_folder=source)
+        try:
+            save_result(result, target, figures=figures, input_folder=source)
+        except OSError as error:
+            raise InputError(
+                "The result cannot be written.",
+                file=target,
+                found=error.strerror or str(error),
+                remedy="free some space or choose another folder with -o, and run again",
+            ) from None
     if not quiet:
         stdout.print(f"written to {escape(str(target))}")
 

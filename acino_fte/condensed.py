@@ -279,12 +279,12 @@ class Condensed:
             for a in range(3):
                 for b in range(a):
                     inner[:, b, a] = inner[:, a, b]
-            inner = inner.reshape(n, m, 3, 3)
+            curvature = inner.reshape(n, m, 3, 3)
             for start in range(0, n, _FRAMES):
                 part = slice(start, start + _FRAMES)
                 jacobian = self._linear[1][part]
                 flat = jacobian.reshape(-1, 3 * m, d)
-                carried = (inner[part] @ jacobian).reshape(-1, 3 * m, d)
+                carried = (curvature[part] @ jacobian).reshape(-1, 3 * m, d)
                 blocks[0][part] += flat.transpose(0, 2, 1) @ carried
         if self.exact and self._linear is not None:
             blocks[0] += self._kinematic_curvature()

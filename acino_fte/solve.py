@@ -33,6 +33,7 @@ IPOPT_STATUS = {  # IPOPT's return codes (IpReturnCodes_inc.h)
 }
 
 
+HESSIANS = ("auto", "gauss-newton", "exact")
 LINEAR_SOLVERS = ("mumps", "ma27", "ma57", "ma77", "ma86", "ma97", "pardiso")
 
 
@@ -67,19 +68,19 @@ class SolveOptions:
     hessian: str = "auto"
 
     def __post_init__(self) -> None:
-        for name, good in (
-            ("max_iter", self.max_iter >= 0),
-            ("tolerance", self.tolerance > 0),
-            ("max_seconds", self.max_seconds > 0),
-            ("print_level", 0 <= self.print_level <= 12),
-            ("linear_solver", self.linear_solver in LINEAR_SOLVERS),
-            ("hessian", self.hessian in ("auto", "gauss-newton", "exact")),
+        for name, good, expected in (
+            ("max_iter", self.max_iter >= 0, "0 or more"),
+            ("tolerance", 0 < self.tolerance < np.inf, "a number above 0 (--tol)"),
+            ("max_seconds", self.max_seconds > 0, "more than 0 seconds"),
+            ("print_level", 0 <= self.print_level <= 12, "0 to 12"),
+            ("linear_solver", self.linear_solver in LINEAR_SOLVERS, f"one of {', '.join(LINEAR_SOLVERS)}"),
+            ("hessian", self.hessian in HESSIANS, f"one of {', '.join(HESSIANS)}"),
         ):
             if not good:
                 raise InputError(
                     f"The solver option {name} cannot be {getattr(self, name)!r}.",
                     key=name,
-                    expected=f"one of {', '.join(LINEAR_SOLVERS)}" if name == "linear_solver" else None,
+                    expected=expected,
                     remedy="see --help",
                 )
 
