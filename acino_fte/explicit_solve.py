@@ -21,7 +21,7 @@ from acino_fte.errors import InputError
 from acino_fte.explicit import build_explicit, read_states
 from acino_fte.problem import FTEProblem
 from acino_fte.result import Status
-from acino_fte.solve import IPOPT_STATUS, Minimum, Progress, SolveOptions
+from acino_fte.solve import IPOPT_STATUS, Minimum, Progress, SolveOptions, check_linear_solver
 
 ROUTES = ("ipopt", "pynumero", "casadi")
 _NAMES = {
@@ -66,6 +66,7 @@ def solve_explicit(
         status, iterations = _solve_pyomo(model, options, route)
     else:
         raise InputError(f"There is no solve route '{route}'.", expected=", ".join(ROUTES))
+    check_linear_solver(status, iterations, options)
     q = np.clip(read_states(model), problem.lower, problem.upper)
     return Minimum(status, q, float(pyo.value(model.objective)), iterations)
 

@@ -34,7 +34,8 @@ IPOPT_STATUS = {  # IPOPT's return codes (IpReturnCodes_inc.h)
 
 
 HESSIANS = ("auto", "gauss-newton", "exact")
-LINEAR_SOLVERS = ("mumps", "ma27", "ma57", "ma77", "ma86", "ma97", "pardiso")
+# IPOPT knows ma97 too, but crashes when that library is missing
+LINEAR_SOLVERS = ("mumps", "ma27", "ma57", "ma77", "ma86", "pardiso")
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class SolveOptions:
         for name, good, expected in (
             ("max_iter", self.max_iter >= 0, "0 or more"),
             ("tolerance", 0 < self.tolerance < np.inf, "a number above 0 (--tol)"),
+            ("acceptable_tolerance", self.acceptable_tolerance > 0, "a number above 0"),
             ("max_seconds", self.max_seconds > 0, "more than 0 seconds"),
             ("print_level", 0 <= self.print_level <= 12, "0 to 12"),
             ("linear_solver", self.linear_solver in LINEAR_SOLVERS, f"one of {', '.join(LINEAR_SOLVERS)}"),
@@ -193,18 +195,23 @@ def minimise(
     if callbacks.stop and enough:
         raise KeyboardInterrupt  # a start that was cut off is nothing to keep
     status = IPOPT_STATUS.get(info["status"], Status.FAILED)
-    if status is Status.FAILED and not callbacks.iterations and options.linear_solver != "mumps":
-        raise InputError(
-            f"IPOPT could not load the linear solver '{options.linear_solver}'.",
-            key="linear_solver",
-            remedy="use 'mumps', which comes with IPOPT, or install that solver's library",
-        )
+    check_linear_solver(status, callbacks.iterations, options)
     value = float(info["obj_val"])
     if not status.ok and callbacks.best[0] < np.inf:
         value, x = callbacks.best
     return Minimum(
         status, np.clip(x.reshape(start.shape), problem.lower, problem.upper), value, callbacks.iterations
     )
+
+
+def check_linear_solver(status: Status, iterations: int, options: SolveOptions) -> None:
+    """Raise InputError when IPOPT never began because it has no such linear solver."""
+    if status is Status.FAILED and not iterations and options.linear_solver != "mumps":
+        raise InputError(
+            f"IPOPT could not load the linear solver '{options.linear_solver}'.",
+            key="linear_solver",
+            remedy="use 'mumps', which comes with IPOPT, or install that solver's library",
+        )
 
 
 # Relative decrease per iteration below which the exact Hessian takes over. Residuals are large where the
