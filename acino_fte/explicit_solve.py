@@ -121,7 +121,7 @@ def _solve_casadi(
         variable.set_value(float(value), skip_validation=True)
     stats = solver.stats()
     code = _NAMES.get(stats["return_status"], -199)
-    iterations = int(stats.get("iter_count", 0))
+    iterations = int(stats.get("iter_count", 0)) if code in IPOPT_STATUS else 0  # unset when it never ran
     if progress is not None:
         progress(iterations, float(solution["f"]))
     status = Status.INTERRUPTED if interrupted else IPOPT_STATUS.get(code, Status.FAILED)
