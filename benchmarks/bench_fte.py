@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,6 @@ def in_fresh_process(n_frames: int, repeats: int) -> dict[str, Any]:
 def explicit_case(n_frames: int) -> dict[str, Any]:
     """The explicit model: build, write and solve, against the condensed one from the same start."""
     from acino_fte.explicit import build_explicit
-    from acino_fte.explicit_solve import available_route, solve_explicit
     from acino_fte.initialise import initial_trajectory
     from acino_fte.problem import build_fte
     from acino_fte.solve import minimise
@@ -108,21 +107,8 @@ def explicit_case(n_frames: int) -> dict[str, Any]:
     began = time.perf_counter()
     condensed = minimise(build_fte(sequence, kinematics), start)
     condensed_seconds = time.perf_counter() - began
-    began = time.perf_counter()
-    model = build_explicit(problem, start)
-    build = time.perf_counter() - began
-    write, size = write_nl(model)
-    began = time.perf_counter()
-    minimum = solve_explicit(model, problem)
-    return {
-        "frames": n_frames,
-        "route": available_route(),
-        "build": build,
-        "write": write,
-        "nl_mb": size,
-        "solve": time.perf_counter() - began,
-        "iterations": minimum.iterations,
-        "status": str(minimum.status),
+    measured, minimum = timed(build_explicit, problem, start)
+    return measured | {
         "condensed_build_solve": condensed_seconds,
         "relative_objective_difference": abs(minimum.objective / condensed.objective - 1),
     }
@@ -132,7 +118,6 @@ def acinoset_case(n_frames: int) -> dict[str, Any]:
     """AcinoSet's formulation: build, write and solve (capped), on the first frames of the same gallop."""
     from acinoset_formulation import build as build_acinoset
 
-    from acino_fte.explicit_solve import available_route, solve_explicit
     from acino_fte.initialise import initial_trajectory
     from acino_fte.problem import build_fte
     from acino_fte.solve import SolveOptions
@@ -140,22 +125,33 @@ def acinoset_case(n_frames: int) -> dict[str, Any]:
     sequence, kinematics = make_sequence(n_frames)
     problem = build_fte(sequence, kinematics)
     start = initial_trajectory(sequence, kinematics)
+    measured, _ = timed(build_acinoset, problem, start, SolveOptions(max_seconds=ACINOSET_CAP))
+    return measured
+
+
+def timed(
+    build: Callable[..., Any], problem: Any, start: Any, options: Any = None
+) -> tuple[dict[str, Any], Any]:
+    """Build, write and solve a Pyomo model: the seconds of each, and the minimum."""
+    from acino_fte.explicit_solve import available_route, solve_explicit
+
     began = time.perf_counter()
-    model = build_acinoset(problem, start)
-    build = time.perf_counter() - began
+    model = build(problem, start)
+    built = time.perf_counter() - began
     write, size = write_nl(model)
     began = time.perf_counter()
-    minimum = solve_explicit(model, problem, replace(SolveOptions(), max_seconds=ACINOSET_CAP))
-    return {
-        "frames": n_frames,
+    minimum = solve_explicit(model, problem, options)
+    measured = {
+        "frames": problem.n_frames,
         "route": available_route(),
-        "build": build,
+        "build": built,
         "write": write,
         "nl_mb": size,
         "solve": time.perf_counter() - began,
         "iterations": minimum.iterations,
         "status": str(minimum.status),
     }
+    return measured, minimum
 
 
 def write_nl(model: Any) -> tuple[float, float]:
