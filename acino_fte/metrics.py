@@ -66,7 +66,8 @@ def result_metrics(result: FTEResult) -> dict[str, Any]:
         "speed_m_s": speed_metrics(result),
         "joints_at_limit": joints_at_limit(result),
         "joints_outside_limits": joints_outside_limits(result),
-        "parameters": getattr(result, "parameters", {}),
+        "parameters": result.parameters,
+        "findings": list(result.findings),
         "options": result.options,
         "warnings": list(sequence.warnings),
     }

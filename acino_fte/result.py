@@ -64,9 +64,10 @@ class FTEResult:
     sequence : Sequence
     skeleton : Skeleton
     q, dq, ddq : (N, Q)
-        Degrees of freedom (m, rad), and their first and second backward differences in time.
+        Degrees of freedom (m, rad), and their first and second backward differences in time; (N, 0) from
+        a method without a skeleton (``tri``, ``sba``).
     positions : (N, M, 3)
-        Marker positions, world frame, m.
+        Marker positions, world frame, m; NaN where a method has none.
     observed : (N, C, M, 2)
         Detections that entered the problem, px; NaN elsewhere.
     reprojected : (N, C, M, 2)
@@ -75,11 +76,21 @@ class FTEResult:
         Value of the objective at the trajectory (a negative log-posterior up to a constant).
     iterations : int
     method : str
-        ``"fte-condensed"`` or ``"fte-explicit"``.
+        ``"fte-condensed"``, ``"fte-explicit"``, ``"tri"``, ``"sba"`` or ``"ekf"``.
     seconds : dict
         Time spent: load, initialise, build, solve.
     options : dict
         Options of the problem and of the solver, as they were used.
+    parameters : dict
+        What was estimated beside the trajectory: family (``time_offset_s``, ``segment_scale``,
+        ``extrinsics``, ``marker_offset_m``, ``noise_px``, …) → name → value; ``<family>_sd`` beside it.
+    q_sd : (N, Q), optional
+        Posterior standard deviations of the degrees of freedom, m and rad.
+    position_covariance : (N, M, 3, 3), optional
+        Posterior covariance of every marker, m².
+    findings : tuple of str
+        What the estimate noticed about the recording: swapped sides, cameras that moved or are out of
+        step, parameters that could not be observed. One sentence each.
     """
 
     status: Status
@@ -96,6 +107,10 @@ class FTEResult:
     method: str
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
+    parameters: dict[str, Any] = field(default_factory=dict)
+    q_sd: np.ndarray | None = None
+    position_covariance: np.ndarray | None = None
+    findings: tuple[str, ...] = ()
 
     @cached_property
     def residuals(self) -> np.ndarray:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
+
+import numpy as np
 
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.species_faults import plain_name, structure_faults
@@ -60,13 +62,15 @@ class Dof:
 class Link:
     """A rigid link: name, index of its parent (−1: world), origin in the parent (m), its DOF indices.
 
-    The DOF are in the order of rotation, outermost first.
+    The DOF are in the order of rotation, outermost first. ``group`` is the index in ``Skeleton.groups`` of
+    the scale that everything attached to the link shares (−1: nothing is attached).
     """
 
     name: str
     parent: int
     at: tuple[float, float, float]
     dofs: tuple[int, ...]
+    group: int = -1
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,8 @@ class Skeleton:
         Markers and their mirrored twins: left, right.
     noise_fps : float
         Frame rate (Hz) that the process noise of the DOF is stated at.
+    groups : tuple of str
+        Names of the segment groups: the lengths of a group's links have one scale in common.
     """
 
     name: str
@@ -108,6 +114,7 @@ class Skeleton:
     capsules: tuple[tuple[int, int, float], ...] = ()
     twins: tuple[tuple[str, str], ...] = ()
     noise_fps: float = 120.0
+    groups: tuple[str, ...] = ()
     source: str = ""
     path: Path | None = field(default=None, compare=False)
 
@@ -146,11 +153,11 @@ class Skeleton:
     def content_hash(self) -> str:
         """Hash of everything the kinematics depend on."""
         parts = [
-            (link.parent, link.at, [(self.dofs[d].kind, self.dofs[d].axis, d) for d in link.dofs])
+            (link.parent, link.at, link.group, [(self.dofs[d].kind, self.dofs[d].axis, d) for d in link.dofs])
             for link in self.links
         ]
         markers = [(m.link, m.at) for m in self.markers]
-        return sha256(repr((parts, markers, len(self.dofs))).encode()).hexdigest()[:24]
+        return sha256(repr((parts, markers, len(self.dofs), len(self.groups))).encode()).hexdigest()[:24]
 
 
 def _index(names: list[str], name: str, what: str, species: str) -> int:
@@ -210,7 +217,8 @@ def expand(species: SpeciesFile, path: Path | None = None) -> Skeleton:
     scale = _LENGTH[species.units.length]
     dofs = _expand_dofs(species, whole)
     state = species.order or list(dofs)
-    links = _expand_links(whole, {name: i for i, name in enumerate(state)}, scale)
+    groups, group_of = _groups(species, whole)
+    links = _expand_links(whole, {name: i for i, name in enumerate(state)}, scale, group_of)
     link_index = {link.name: i for i, link in enumerate(links)}
     markers = tuple(
         Marker(name, link_index[entry.link], _vector(entry.at, scale), entry.sd_px, tuple(entry.aliases))
@@ -230,6 +238,7 @@ def expand(species: SpeciesFile, path: Path | None = None) -> Skeleton:
         capsules=tuple((a, b, radius) for (a, b), radius in capsules.items()),
         twins=tuple(whole.marker_twins.items()),
         noise_fps=species.noise_fps,
+        groups=groups,
         source=species.source,
         path=path,
     )
@@ -239,7 +248,61 @@ def _vector(values: list[float], scale: float) -> tuple[float, float, float]:
     return values[0] * scale, values[1] * scale, values[2] * scale
 
 
-def _expand_links(whole: Mirrored, place: Mapping[str, int], scale: float) -> tuple[Link, ...]:
+def _groups(species: SpeciesFile, whole: Mirrored) -> tuple[tuple[str, ...], dict[str, int]]:
+    """Names of the segment groups, and the group of every link that something is attached to.
+
+    Twins share a group; a link in no declared group makes one of its own.
+    """
+    attached = [(entry.parent, entry.at) for entry in whole.links.values()]
+    attached += [(entry.link, entry.at) for entry in whole.markers.values()]
+    long = {name for name, at in attached if any(at)}
+    original = {twin: name for name, twin in whole.link_twins.items()}
+    declared = {original.get(n, n): group for group, names in species.groups.items() for n in names}
+    group_of = {
+        name: declared.get(original.get(name, name), original.get(name, name))
+        for name in whole.links
+        if name in long
+    }
+    names = tuple(dict.fromkeys(group_of.values()))
+    return names, {name: names.index(group) for name, group in group_of.items()}
+
+
+def deformed(
+    skeleton: Skeleton,
+    scales: Mapping[str, float] | None = None,
+    offsets: Mapping[str, Iterable[float]] | None = None,
+) -> Skeleton:
+    """The same species with other proportions: one individual.
+
+    Parameters
+    ----------
+    scales : dict, optional
+        Factor on the lengths of a segment group, by its name.
+    offsets : dict, optional
+        Displacement (x, y, z) of a marker in its link's frame, m, by its name.
+    """
+    factor = np.ones(len(skeleton.groups) + 1)  # the last one is for links without a group
+    for name, value in (scales or {}).items():
+        factor[_index(list(skeleton.groups), name, "segment group", skeleton.name)] = value
+    shift = np.zeros((len(skeleton.markers), 3))
+    for name, vector in (offsets or {}).items():
+        shift[skeleton.marker(name)] = list(vector)
+
+    def scaled(at: tuple[float, float, float], parent: int) -> np.ndarray:
+        group = skeleton.links[parent].group if parent >= 0 else -1
+        return np.array(at) * factor[group]
+
+    links = tuple(replace(link, at=tuple(scaled(link.at, link.parent).tolist())) for link in skeleton.links)
+    markers = tuple(
+        replace(m, at=tuple((scaled(m.at, m.link) + shift[i]).tolist()))
+        for i, m in enumerate(skeleton.markers)
+    )
+    return replace(skeleton, links=links, markers=markers)
+
+
+def _expand_links(
+    whole: Mirrored, place: Mapping[str, int], scale: float, group_of: Mapping[str, int]
+) -> tuple[Link, ...]:
     """Links, parents first, otherwise in the order of the file."""
     parents = {name: entry.parent for name, entry in whole.links.items()}
     order: list[str] = []
@@ -251,6 +314,7 @@ def _expand_links(whole: Mirrored, place: Mapping[str, int], scale: float) -> tu
             order.index(parents[name]) if parents[name] != "world" else -1,
             _vector(whole.links[name].at, scale),
             tuple(place[f"{name}.{dof}"] for dof in whole.links[name].dofs),
+            group_of.get(name, -1),
         )
         for name in order
     )

@@ -31,6 +31,7 @@ def structure_faults(species: SpeciesFile, mirrored: Mirrored | None = None) -> 
         *_loops({name: entry.parent for name, entry in whole.links.items()}),
         *_marker_links(whole),
         *_pairs(species, whole.markers),
+        *_groups(species, whole),
         *_order(species, whole),
         *_aliases(whole),
     ]
@@ -105,6 +106,33 @@ def _pairs(species: SpeciesFile, markers: Iterable[str]) -> Iterator[Fault]:
                 )
         if pair[0] == pair[1]:
             yield Fault(key, f"'{pair[0]}' is paired with itself.", remedy="name two different markers")
+
+
+def _groups(species: SpeciesFile, whole: Mirrored) -> Iterator[Fault]:
+    """Links that do not exist, and links in two groups (a twin counts as its original)."""
+    original = {twin: name for name, twin in whole.link_twins.items()}
+    owner: dict[str, str] = {}
+    for group, names in species.groups.items():
+        for name in names:
+            if name not in whole.links:
+                yield Fault(
+                    f"groups.{group}",
+                    f"'{name}' is no link{did_you_mean(name, whole.links)}",
+                    expected=f"one of {', '.join(whole.links)}",
+                    remedy="mend the name, or declare the link",
+                )
+            elif owner.setdefault(original.get(name, name), group) != group:
+                yield Fault(
+                    f"groups.{group}",
+                    f"Link '{name}' is in the groups '{owner[original.get(name, name)]}' and '{group}'.",
+                    remedy="keep it in one of them; twins always share a group",
+                )
+        if group in whole.links and original.get(group, group) not in [original.get(n, n) for n in names]:
+            yield Fault(
+                f"groups.{group}",
+                f"The group '{group}' is named like a link that is not in it.",
+                remedy="give the group another name",
+            )
 
 
 def _order(species: SpeciesFile, whole: Mirrored) -> Iterator[Fault]:

@@ -108,6 +108,11 @@ class SpeciesFile(_Strict):
     markers: dict[Name, MarkerEntry] = Field(min_length=1)
     draw: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = Field(default_factory=list)
     body: list[BodyEntry] = Field(default_factory=list)
+    groups: dict[Name, Annotated[list[str], Field(min_length=1)]] = Field(
+        default_factory=dict,
+        description="links whose lengths are estimated together (--fit scale); twins are included, and "
+        "every link that is not named makes a group of its own",
+    )
     order: list[str] | None = Field(
         None, description="order of the state vector (link.dof); by default that of the file"
     )
