@@ -50,7 +50,7 @@ def observability(skeleton: Skeleton, markers: Iterable[str] | None = None) -> O
     """
     rows = [skeleton.marker(name) for name in markers] if markers is not None else slice(None)
     q = random_poses(skeleton, _POSES, seed=0)
-    _, jacobian, _ = load_kinematics(skeleton).linearise(q)
+    jacobian = load_kinematics(skeleton).linearise(q).jacobian
     jacobian = jacobian[:, rows].reshape(_POSES, -1, len(skeleton.dofs))  # (poses, 3 M, Q)
     size = np.linalg.norm(jacobian, axis=(0, 1))
     unseen = size <= _TOLERANCE * max(size.max(), 1e-300)

@@ -1,9 +1,12 @@
 """The full trajectory estimation problem, stated but not solved.
 
-Minimise over q (N, Q), within its bounds, the negative log-posterior
+Minimise over q (N, Q), within its bounds,
+the negative log-posterior
 
-    Σ_frames,cameras,markers ρ(|π(p(q)) − z|/σ_px)  +  ½ Σ (w/σ_w)²  +  ½ Σ ((q − mean)/σ_prior)²,
+    Σ_frames,cameras,markers ρ(|π(p(q, θ)) − z|/σ_px)  +  ½ Σ (w/σ_w)²  +  ½ Σ ((q − mean)/σ_prior)²
+        +  ½ Σ (θ/σ_θ)²
 
+and over the global parameters θ (:mod:`acino_fte.parameters`), within theirs,
 with w the jump of acceleration from frame to frame (Joska et al. 2021, eq. 4–9, with the ½ of a Gaussian
 likelihood, so that the curvature at the optimum is an information matrix).
 """
@@ -16,11 +19,15 @@ from typing import Any
 
 import numpy as np
 
+from acino_fte import delay
 from acino_fte.errors import InputError
 from acino_fte.kinematics import Kinematics
 from acino_fte.losses import Loss
+from acino_fte.parameters import KINEMATIC, Parameters, PriorWidths, check_families, declare
 from acino_fte.sequence import Sequence
-from acino_fte.terms import Term, measurement_term, model_term, prior_term
+from acino_fte.terms import Term, measurement_term, model_term, parameter_term, prior_term
+
+_NONE = Parameters()
 
 
 @dataclass(frozen=True)
@@ -38,12 +45,18 @@ class FTEOptions:
         gives smoother motion.
     prior_width : float
         Width of the joint-angle prior in units of half the joint's range; 0 leaves it out.
+    fit : tuple of str
+        Families of global parameters to estimate (:data:`acino_fte.parameters.FAMILIES`).
+    widths : PriorWidths
+        Standard deviations of their priors.
     """
 
     likelihood: float = 0.5
     loss: Loss = field(default_factory=Loss)
     noise_scale: float = 1.0
     prior_width: float = 2.0
+    fit: tuple[str, ...] = ()
+    widths: PriorWidths = field(default_factory=PriorWidths)
 
     def __post_init__(self) -> None:
         for name, value, good in (
@@ -53,6 +66,7 @@ class FTEOptions:
         ):
             if not good:
                 raise InputError(f"The option {name} cannot be {value}.", key=name, remedy="see --help")
+        object.__setattr__(self, "fit", check_families(self.fit))
 
     def summary(self) -> dict[str, Any]:
         """The options as plain values for the record."""
@@ -61,7 +75,7 @@ class FTEOptions:
 
 @dataclass(frozen=True, eq=False)
 class FTEProblem:
-    """A trajectory problem: terms over q (N, Q) and bounds. Made by :func:`build_fte`, solved elsewhere.
+    """A trajectory problem: terms over q (N, Q) and θ (P,), and bounds. Made by :func:`build_fte`, solved elsewhere.
 
     Attributes
     ----------
@@ -76,6 +90,8 @@ class FTEProblem:
     options : FTEOptions
     sequence : Sequence, optional
         What the problem was built from.
+    parameters : Parameters
+        The global parameters θ.
     """
 
     kinematics: Kinematics
@@ -86,6 +102,7 @@ class FTEProblem:
     upper: np.ndarray
     options: FTEOptions = field(default_factory=FTEOptions)
     sequence: Sequence | None = None
+    parameters: Parameters = field(default_factory=Parameters)
 
     @property
     def n_frames(self) -> int:
@@ -107,24 +124,38 @@ class FTEProblem:
         width = np.where(np.isfinite(self.upper - self.lower), self.upper - self.lower, 0.0)
         return np.clip(q, self.lower + margin * width, self.upper - margin * width)
 
+    def proportions(self, theta: np.ndarray) -> np.ndarray | None:
+        """The part of θ that the kinematics take."""
+        return theta[: self.parameters.n_kinematic] if self.kinematics.n_parameters else None
+
     def with_terms(self, *terms: Term) -> FTEProblem:
         """The same problem with more terms."""
         return replace(self, terms=(*self.terms, *terms))
 
 
 def build_problem(
-    kinematics: Kinematics, fps: float, frames: np.ndarray, terms: list[Term], options: FTEOptions
+    kinematics: Kinematics,
+    fps: float,
+    frames: np.ndarray,
+    terms: list[Term],
+    options: FTEOptions,
+    parameters: Parameters = _NONE,
 ) -> FTEProblem:
-    """Add motion model, prior and bounds to terms that hold the data."""
+    """Add motion model, priors and bounds to terms that hold the data."""
     skeleton, n = kinematics.skeleton, len(frames)
     if n > 3:
         model = model_term(skeleton, n, fps)
         terms = [*terms, replace(model, sd=model.sd * options.noise_scale)]
     if options.prior_width > 0:
         terms = [*terms, prior_term(skeleton, n, options.prior_width)]
+    if len(parameters):
+        terms = [*terms, parameter_term(parameters)]
+        kinematics = kinematics.with_parameters(f for f in parameters.families if f in KINEMATIC)
     lower = np.array([d.lower for d in skeleton.dofs])
     upper = np.array([d.upper for d in skeleton.dofs])
-    return FTEProblem(kinematics, fps, np.asarray(frames), tuple(terms), lower, upper, options)
+    return FTEProblem(
+        kinematics, fps, np.asarray(frames), tuple(terms), lower, upper, options, parameters=parameters
+    )
 
 
 def build_fte(sequence: Sequence, kinematics: Kinematics, options: FTEOptions | None = None) -> FTEProblem:
@@ -139,8 +170,9 @@ def build_fte(sequence: Sequence, kinematics: Kinematics, options: FTEOptions | 
     skeleton = kinematics.skeleton
     pixels = sequence.pixels(skeleton.marker_names, options.likelihood)
     sd = np.array([m.sd_px for m in skeleton.markers])
+    parameters = _parameters(sequence, skeleton, options)
     terms = [
-        measurement_term(camera, pixels[:, c], sd, options.loss, sequence.n_frames)
+        measurement_term(camera, pixels[:, c], sd, options.loss, sequence.n_frames, parameters)
         for c, camera in enumerate(sequence.cameras)
     ]
     present = [term for term in terms if term is not None]
@@ -150,5 +182,11 @@ def build_fte(sequence: Sequence, kinematics: Kinematics, options: FTEOptions | 
             key="likelihood",
             remedy="lower --likelihood, or choose frames in which the animal is seen",
         )
-    problem = build_problem(kinematics, sequence.fps, sequence.frames, present, options)
+    problem = build_problem(kinematics, sequence.fps, sequence.frames, present, options, parameters)
     return replace(problem, sequence=sequence)
+
+
+def _parameters(sequence: Sequence, skeleton: Skeleton, options: FTEOptions) -> Parameters:
+    """The parameters that the options ask for; no delays in a recording shorter than their stencil."""
+    families = [f for f in options.fit if f != "delay" or sequence.n_frames >= delay.NODES]
+    return declare(families, skeleton, sequence.cameras.names, sequence.fps, options.widths)

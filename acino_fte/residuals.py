@@ -1,7 +1,7 @@
 """Residuals: formulas declared once as SymPy expressions, and what both lowerings make of them.
 
 A :class:`Residual` speaks of *handles* (a marker's position, a degree of freedom, its velocity or
-acceleration, now or some frames ago) and of named data. The explicit lowering takes it as declared
+acceleration, now or some frames ago; a global parameter) and of named data. The explicit lowering takes it as declared
 (:func:`residual_program`); the condensed one takes it with velocities and accelerations replaced by
 backward differences of q, and with first and second derivatives (:func:`lower`).
 """
@@ -34,16 +34,20 @@ class Handle:
     ----------
     kind : str
         ``"position"`` (a marker, three numbers, m), ``"dof"`` (q), ``"velocity"`` or ``"acceleration"``
-        (its backward differences in time).
+        (its backward differences in time), or ``"parameter"`` (one of the global parameters θ).
     lag : int
         How many frames ago.
     item : int
-        Which column of the term's ``items`` says which marker or degree of freedom is meant.
+        Which column of the term's ``items`` says which marker, degree of freedom or parameter is meant.
+    delay : int, optional
+        For a position at t + τ: which column of ``items`` says which parameter τ is
+        (:mod:`acino_fte.delay`).
     """
 
     kind: str
     lag: int = 0
     item: int = 0
+    delay: int | None = None
 
 
 @dataclass(frozen=True)
@@ -83,19 +87,19 @@ class Residual:
     @property
     def reach(self) -> int:
         """How many frames back the formula needs q."""
-        return max(lag for handle in self.handles for (_, lag, _), _ in _stencil(handle))
+        return max(source.lag for handle in self.handles for source, _ in _stencil(handle))
 
 
 @dataclass(frozen=True)
 class Lowered:
-    """A residual in terms of positions and q alone, as programs.
+    """A residual in terms of positions, q and parameters alone, as programs.
 
-    ``inputs`` lists the local variables in order: (``position`` or ``dof``, lag, item), a position
-    counting three. ``programs`` are ``value`` (components, guards), ``slope`` (components, guards, then
+    ``inputs`` lists the local variables in order, as handles of the kinds ``position``, ``dof`` and
+    ``parameter``, a position counting three. ``programs`` are ``value`` (components, guards), ``slope`` (components, guards, then
     ∂component/∂variable) and ``curvature`` (the same, then the second derivatives for variable pairs i ≥ j).
     """
 
-    inputs: tuple[tuple[str, int, int], ...]
+    inputs: tuple[Handle, ...]
     n_variables: int
     linear: bool
     programs: dict[str, Program]
@@ -148,17 +152,22 @@ def lower(residual: Residual) -> Lowered:
     """Eliminate velocities and accelerations: v_n = (q_n − q_{n−1})/Δt, a_n = (v_n − v_{n−1})/Δt."""
     inputs = tuple(dict.fromkeys(i for handle in residual.handles for i, _ in _stencil(handle)))
     programs = _cached(residual, "lowered", lambda: _derive_lowered(residual, inputs))
-    n = sum(3 if kind == "position" else 1 for kind, _, _ in inputs)
+    n = sum(width(source) for source in inputs)
     slopes = programs["slope"].outputs[len(programs["value"].outputs) :]
     moving = _depends_on(programs["slope"], slopes, {f"y{i}" for i in range(n)})
     return Lowered(inputs, n, not moving, programs)
 
 
-def _stencil(handle: Handle) -> list[tuple[tuple[str, int, int], int]]:
+def width(handle: Handle) -> int:
+    """How many numbers a handle stands for."""
+    return 3 if handle.kind == "position" else 1
+
+
+def _stencil(handle: Handle) -> list[tuple[Handle, int]]:
     """The variables behind a handle, with their weights (to be divided by Δt, Δt² for derivatives)."""
-    if handle.kind == "position":
-        return [(("position", handle.lag, handle.item), 1)]
-    return [(("dof", handle.lag + k, handle.item), w) for k, w in enumerate(_STENCIL[handle.kind])]
+    if handle.kind in ("position", "parameter"):
+        return [(handle, 1)]
+    return [(Handle("dof", handle.lag + k, handle.item), w) for k, w in enumerate(_STENCIL[handle.kind])]
 
 
 def _depends_on(program: Program, outputs: tuple[str, ...], names: set[str]) -> bool:
@@ -170,25 +179,25 @@ def _depends_on(program: Program, outputs: tuple[str, ...], names: set[str]) -> 
     return bool(tainted & set(outputs))
 
 
-def _derive_lowered(residual: Residual, inputs: tuple[tuple[str, int, int], ...]) -> dict[str, Program]:
+def _derive_lowered(residual: Residual, inputs: tuple[Handle, ...]) -> dict[str, Program]:
     import sympy as sp
 
     handles, data, _ = _symbols(residual)
-    n = sum(3 if kind == "position" else 1 for kind, _, _ in inputs)
+    n = sum(width(source) for source in inputs)
     y = list(sp.symbols(f"y0:{n}", real=True))
-    place: dict[tuple[str, int, int], list[sp.Symbol]] = {}
+    place: dict[Handle, list[sp.Symbol]] = {}
     used = 0
-    for key in inputs:
-        width = 3 if key[0] == "position" else 1
-        place[key] = y[used : used + width]
-        used += width
+    for source in inputs:
+        place[source] = y[used : used + width(source)]
+        used += width(source)
     values: list[Any] = []
     for handle in residual.handles:
         stencil = _stencil(handle)
         if handle.kind == "position":
             values.append(tuple(place[stencil[0][0]]))
         else:
-            values.append(sum(w * place[key][0] for key, w in stencil) / data["dt"] ** (len(stencil) - 1))
+            total = sum(w * place[source][0] for source, w in stencil)
+            values.append(total / data["dt"] ** (len(stencil) - 1))
     chain = _Chain([*y, *data.values()], y)
     components, guards = residual.derive(values, data, chain.let)
     base = [*components, *guards]

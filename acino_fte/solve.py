@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -109,12 +109,17 @@ class SolveOptions:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where a solve ended: status, q (N, Q), objective, iterations."""
+    """Where a solve ended: status, q (N, Q), objective, iterations, θ (P,), multipliers of the bounds.
+
+    ``multipliers`` (N, Q) is what the bounds on q hold back: positive where a joint is at its limit.
+    """
 
     status: Status
     q: np.ndarray
     objective: float
     iterations: int
+    theta: np.ndarray = field(default_factory=lambda: np.empty(0))
+    multipliers: np.ndarray | None = None
 
 
 class _Callbacks:
@@ -167,8 +172,9 @@ def minimise(
     options: SolveOptions | None = None,
     progress: Progress | None = None,
     enough: float = 0.0,
+    theta: np.ndarray | None = None,
 ) -> Minimum:
-    """Minimise a problem from q (N, Q) by its condensed lowering.
+    """Minimise a problem from q (N, Q) and θ (P,), zero when left out, by its condensed lowering.
 
     Ctrl-C ends it with the best iterate so far and the status ``interrupted``. ``enough`` stops it early
     once an iteration lowers the objective by less than this fraction: for a start, not for a result, so
@@ -179,19 +185,13 @@ def minimise(
     options = options or SolveOptions()
     condensed = Condensed(problem, exact=options.hessian == "exact")
     callbacks = _Callbacks(condensed, progress, enough, refine=options.hessian == "auto" and not enough)
-    n = problem.n_frames
-    start = problem.clip(start)
-    solver = cyipopt.Problem(
-        n=start.size,
-        m=0,
-        problem_obj=callbacks,
-        lb=np.tile(np.where(np.isfinite(problem.lower), problem.lower, -1e20), n),
-        ub=np.tile(np.where(np.isfinite(problem.upper), problem.upper, 1e20), n),
-    )
+    x0 = condensed.pack(problem.clip(start), np.zeros(condensed.n_parameters) if theta is None else theta)
+    lower, upper = bounds(problem)
+    solver = cyipopt.Problem(n=x0.size, m=0, problem_obj=callbacks, lb=lower, ub=upper)
     for name, value in {**options.ipopt(), **_STRATEGY}.items():
         solver.add_option(name, value)
     with _stop_on_interrupt(callbacks):
-        x, info = solver.solve(start.ravel())
+        x, info = solver.solve(x0)
     if callbacks.stop and enough:
         raise KeyboardInterrupt  # a start that was cut off is nothing to keep
     status = IPOPT_STATUS.get(info["status"], Status.FAILED)
@@ -199,9 +199,18 @@ def minimise(
     value = float(info["obj_val"])
     if not status.ok and callbacks.best[0] < np.inf:
         value, x = callbacks.best
-    return Minimum(
-        status, np.clip(x.reshape(start.shape), problem.lower, problem.upper), value, callbacks.iterations
-    )
+    q, found = condensed.unpack(np.clip(x, lower, upper))
+    multipliers = (info["mult_x_L"] + info["mult_x_U"])[: q.size].reshape(q.shape)
+    return Minimum(status, q, value, callbacks.iterations, found, multipliers)
+
+
+def bounds(problem: FTEProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the solver's variables (:mod:`acino_fte.condensed`), ±1e20 for none."""
+    beyond = problem.parameters.bound / problem.parameters.sd
+    lower = np.where(np.isfinite(problem.lower), problem.lower, -1e20)
+    upper = np.where(np.isfinite(problem.upper), problem.upper, 1e20)
+    n = problem.n_frames
+    return np.concatenate([np.tile(lower, n), -beyond]), np.concatenate([np.tile(upper, n), beyond])
 
 
 def check_linear_solver(status: Status, iterations: int, options: SolveOptions) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 from acino_fte import projection
 from acino_fte.cameras import Camera
 from acino_fte.losses import Loss
+from acino_fte.parameters import POSE, Parameters
 from acino_fte.residuals import AXES, Derived, Handle, Let, Residual
 from acino_fte.skeleton import Skeleton
 
@@ -40,7 +41,7 @@ class Term:
     frames : (K,) int
         Frame of each instance, counted from the first of the problem.
     items : (K, I) int
-        Markers or degrees of freedom that the handles refer to.
+        Markers, degrees of freedom or parameters that the handles refer to.
     data : dict
         Each name to a number for all instances or an array (K,).
     sd : (K,)
@@ -68,25 +69,49 @@ class Term:
         return replace(self, frames=self.frames[keep], items=self.items[keep], data=data, sd=self.sd[keep])
 
 
+_NONE = Parameters()
 _POSE = tuple(f"r{i}{j}" for i in range(3) for j in range(3)) + ("tx", "ty", "tz")
 
 
 @cache
-def measurement_residual(model: str) -> Residual:
-    """Reprojection residual of a marker, px: π(R·p + t) − (u, v)."""
+def measurement_residual(model: str, *, moved: bool = False, delayed: bool = False) -> Residual:
+    """Reprojection residual of a marker, px: π(C(ρ)·(R·p + t) + d) − (u, v).
+
+    Items: the marker; the time offset, when ``delayed``, so that p is the position at t + τ; then, when
+    ``moved``, the six parameters ρ, d of the camera's correction. C is Cayley's rotation,
+    C(ρ) x = x + (ρ × x + ½ ρ × (ρ × x)) / (1 + ρ²/4), which turns by 2 atan(|ρ|/2) about ρ.
+    """
 
     def derive(handles: list[Any], data: dict[str, sp.Symbol], let: Let) -> Derived:
-        (p,) = handles
+        p = handles[0]
         local = [
             let(f"local_{AXES[i]}", sum(data[f"r{i}{j}"] * p[j] for j in range(3)) + data[f"t{AXES[i]}"])
             for i in range(3)
         ]
+        if moved:
+            local = _moved(local, handles[1:4], handles[4:7], let)
         u, v = projection.project(model, (local[0], local[1], local[2]))
         return [u - data["u"], v - data["v"]], [local[2]]
 
     data = ("u", "v", *_POSE, *projection.parameter_names(model))
     sources = (Path(__file__), Path(projection.__file__))
-    return Residual(f"{model}", (Handle("position"),), data, ("u", "v"), "px", derive, sources)
+    handles = [Handle("position", delay=1 if delayed else None)]
+    if moved:
+        handles += [Handle("parameter", item=1 + delayed + k) for k in range(6)]
+    name = "-".join([model] + ["moved"] * moved + ["delayed"] * delayed)
+    return Residual(name, tuple(handles), data, ("u", "v"), "px", derive, sources)
+
+
+def _moved(local: list[Any], rho: list[Any], shift: list[Any], let: Let) -> list[Any]:
+    """A point in the camera's frame after the camera's correction."""
+
+    def cross(a: list[Any], b: list[Any]) -> list[Any]:
+        return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+    once = [let(f"once_{a}", e) for a, e in zip(AXES, cross(rho, local), strict=True)]
+    twice = [let(f"twice_{a}", e) for a, e in zip(AXES, cross(rho, once), strict=True)]
+    size = let("size", 1 + sum(r * r for r in rho) / 4)
+    return [let(f"moved_{AXES[i]}", local[i] + (once[i] + twice[i] / 2) / size + shift[i]) for i in range(3)]
 
 
 def _jump(handles: list[Any], _: dict[str, sp.Symbol], _let: Let) -> Derived:
@@ -107,11 +132,19 @@ JUMP = Residual(
     "jump", (Handle("acceleration"), Handle("acceleration", 1)), (), ("w",), "m/s² or rad/s²", _jump, _HERE
 )
 PRIOR = Residual("prior", (Handle("dof"),), ("mean",), ("q",), "m or rad", _from_mean, _HERE)
+WIDTH = Residual(
+    "width", (Handle("parameter"),), ("mean",), ("theta",), "of the parameter", _from_mean, _HERE
+)
 POINT = Residual("point", (Handle("position"),), ("px", "py", "pz"), AXES, "m", _to_point, _HERE)
 
 
 def measurement_term(
-    camera: Camera, pixels: np.ndarray, sd_px: np.ndarray, loss: Loss, n_frames: int
+    camera: Camera,
+    pixels: np.ndarray,
+    sd_px: np.ndarray,
+    loss: Loss,
+    n_frames: int,
+    parameters: Parameters = _NONE,
 ) -> Term | None:
     """Reprojection of every observed marker in one camera; None when it saw nothing.
 
@@ -133,8 +166,14 @@ def measurement_term(
         data |= {f"r{i}{j}": rotation[i, j] for j in range(3)}
     names = projection.parameter_names(camera.model)
     data |= dict(zip(names, camera.parameters.tolist(), strict=True))
-    residual = measurement_residual(camera.model)
-    return Term("meas", residual, frames, markers[:, None], data, sd_px[markers], loss, camera.name)
+    delay = parameters.place("delay", camera.name)
+    pose = [parameters.place("extrinsics", camera.name, component) for component in POSE]
+    moved = pose[0] is not None
+    residual = measurement_residual(camera.model, moved=moved, delayed=delay is not None)
+    columns = ([delay] if delay is not None else []) + (pose if moved else [])
+    items = np.empty((len(frames), 1 + len(columns)), dtype=int)
+    items[:, 0], items[:, 1:] = markers, columns
+    return Term("meas", residual, frames, items, data, sd_px[markers], loss, camera.name)
 
 
 def model_term(skeleton: Skeleton, n_frames: int, fps: float) -> Term:
@@ -159,6 +198,14 @@ def prior_term(skeleton: Skeleton, n_frames: int, width: float) -> Term:
     mean = np.array([d.middle for d in skeleton.dofs])[dofs]
     half = np.array([0.5 * (d.upper - d.lower) for d in skeleton.dofs])[dofs]
     return Term("prior", PRIOR, frames, dofs[:, None], {"mean": mean}, width * half)
+
+
+def parameter_term(parameters: Parameters) -> Term:
+    """Gaussian prior of every global parameter."""
+    n = len(parameters)
+    return Term(
+        "parameter", WIDTH, np.zeros(n, dtype=int), np.arange(n)[:, None], {"mean": 0.0}, parameters.sd
+    )
 
 
 def point_term(points: np.ndarray, sd: float | np.ndarray, loss: Loss) -> Term:

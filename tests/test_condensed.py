@@ -140,7 +140,7 @@ def test_entries_grow_linearly_with_the_frames(lizard):
     for n in (8, 16, 32):
         condensed = Condensed(random_problem(lizard, n_frames=n)[0])
         size[n] = len(condensed.structure[0])
-        patterns.append(condensed._patterns)
+        patterns.append(condensed._hessian._patterns)
     assert size[32] - size[16] == 2 * (size[16] - size[8])
     for other in patterns[1:]:
         assert all(np.array_equal(a, b) for a, b in zip(patterns[0], other, strict=True))

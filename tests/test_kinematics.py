@@ -126,7 +126,7 @@ def test_positions_equal_homogeneous_transforms(kinematics: Kinematics) -> None:
 
 def test_jacobian_equals_central_differences(kinematics: Kinematics) -> None:
     q, step = poses(kinematics, 3), 1e-6
-    _, jacobian, _ = kinematics.linearise(q)
+    jacobian = kinematics.linearise(q).jacobian
     assert jacobian.shape == (3, kinematics.n_markers, 3, kinematics.n_dofs)
     for j in range(kinematics.n_dofs):
         ahead, behind = q.copy(), q.copy()
@@ -138,12 +138,13 @@ def test_jacobian_equals_central_differences(kinematics: Kinematics) -> None:
 
 def test_positions_of_both_programs_agree(kinematics: Kinematics) -> None:
     q = poses(kinematics)
-    np.testing.assert_allclose(kinematics.linearise(q)[0], kinematics.positions(q), atol=1e-14)
+    np.testing.assert_allclose(kinematics.linearise(q).positions, kinematics.positions(q), atol=1e-14)
 
 
 def test_second_derivatives_are_axis_cross_jacobian(kinematics: Kinematics) -> None:
     q, step = poses(kinematics, 2), 1e-5
-    _, jacobian, axes = kinematics.linearise(q)
+    linear = kinematics.linearise(q)
+    jacobian, axes = linear.jacobian, linear.axes
     skeleton = kinematics.skeleton
     for m in {0, kinematics.n_markers // 2, kinematics.n_markers - 1}:
         chain = skeleton.ancestors(skeleton.markers[m].link)
@@ -151,14 +152,16 @@ def test_second_derivatives_are_axis_cross_jacobian(kinematics: Kinematics) -> N
             ahead, behind = q.copy(), q.copy()
             ahead[:, i] += step
             behind[:, i] -= step
-            difference = (kinematics.linearise(ahead)[1] - kinematics.linearise(behind)[1])[:, m] / (2 * step)
+            difference = (kinematics.linearise(ahead).jacobian - kinematics.linearise(behind).jacobian)[
+                :, m
+            ] / (2 * step)
             for j in chain[place:]:
                 expected = np.cross(axes[:, i], jacobian[:, m, :, j])
                 np.testing.assert_allclose(difference[..., j], expected, atol=1e-7)
 
 
 def test_depends_is_the_pattern_of_the_jacobian(kinematics: Kinematics) -> None:
-    _, jacobian, _ = kinematics.linearise(poses(kinematics))
+    jacobian = kinematics.linearise(poses(kinematics)).jacobian
     moved = np.abs(jacobian).max(axis=(0, 2)) > 1e-12
     assert not (moved & ~kinematics.depends).any()
 
@@ -174,7 +177,7 @@ def test_twists_equal_sympy_differentiation() -> None:
     symbolic = sp.Matrix(kinematics.position_program.run(names, functions))
     expected = sp.lambdify([q], symbolic.jacobian(q), "numpy")
     for pose in np.random.default_rng(0).uniform(-2, 2, (5, len(q))):
-        _, jacobian, _ = kinematics.linearise(pose[None])
+        jacobian = kinematics.linearise(pose[None]).jacobian
         np.testing.assert_allclose(jacobian[0].reshape(-1, len(q)), expected(pose), atol=1e-13)
 
 
@@ -384,4 +387,4 @@ def test_species_have_the_published_sizes() -> None:
 def test_no_frames_give_empty_arrays(kinematics: Kinematics) -> None:
     empty = np.empty((0, kinematics.n_dofs))
     assert kinematics.positions(empty).shape == (0, kinematics.n_markers, 3)
-    assert kinematics.linearise(empty)[1].shape == (0, kinematics.n_markers, 3, kinematics.n_dofs)
+    assert kinematics.linearise(empty).jacobian.shape == (0, kinematics.n_markers, 3, kinematics.n_dofs)

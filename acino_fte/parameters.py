@@ -1,0 +1,232 @@
+"""Global parameters of a recording: what is estimated once, beside the trajectory.
+
+===========  ===========================================================  ==========================
+family       parameters                                                   prior standard deviation
+===========  ===========================================================  ==========================
+scale        log-scale λ of every segment group of the species            0.1
+offsets      displacement of every marker in its link's frame, m          0.03 m
+delay        time offset τ of every camera but the first, s               half a frame
+extrinsics   turn ρ and shift d of every camera but the first:            0.5°, 0.1 m
+             x_camera = Cayley(ρ)·(R x + t) + d
+===========  ===========================================================  ==========================
+
+All priors are Gaussian about zero (the species file, and the calibration as given) and all parameters are
+bounded. The first camera stays as it is: it fixes the origin of time and the frame of the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acino_fte.errors import InputError, did_you_mean
+
+if TYPE_CHECKING:
+    from acino_fte.skeleton import Skeleton
+
+FAMILIES = ("scale", "offsets", "delay", "extrinsics")
+KINEMATIC = ("scale", "offsets")
+POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
+_UNITS = {"scale": "log", "offsets": "m", "delay": "s", "extrinsics": "rad"}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One global parameter: family, whose it is, which component; Gaussian prior about zero, and bound.
+
+    ``sd`` and ``bound`` (|value| ≤ bound) are in the parameter's unit: log, m, s or rad.
+    """
+
+    family: str
+    owner: str
+    component: str
+    sd: float
+    bound: float
+
+    @property
+    def name(self) -> str:
+        """``family.owner`` or ``family.owner.component``."""
+        return ".".join(part for part in (self.family, self.owner, self.component) if part)
+
+    @property
+    def unit(self) -> str:
+        """``"log"``, ``"m"``, ``"s"`` or ``"rad"``."""
+        return "m" if self.component.startswith("t") else _UNITS[self.family]
+
+
+@dataclass(frozen=True)
+class PriorWidths:
+    """Standard deviations of the priors.
+
+    Attributes
+    ----------
+    scale : float
+        Of a segment's log-scale.
+    delay : float
+        Of a camera's time offset, frames.
+    rotation, translation : float
+        Of a camera's turn (rad, per axis) and shift (m, per axis).
+    offset : float
+        Of a marker's displacement, m per axis.
+    """
+
+    scale: float = 0.1
+    delay: float = 0.5
+    rotation: float = float(np.radians(0.5))
+    translation: float = 0.1
+    offset: float = 0.03
+
+
+_REACH = 5.0  # bounds, in prior standard deviations
+_REACH_DELAY = 3.0  # of half a frame: beyond one and a half frames, the stencil extrapolates
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The parameters of one problem, in the order of the vector θ (P,): kinematic ones first."""
+
+    entries: tuple[Parameter, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names in the order of θ."""
+        return [p.name for p in self.entries]
+
+    @cached_property
+    def _places(self) -> dict[tuple[str, str, str], int]:
+        return {(p.family, p.owner, p.component): i for i, p in enumerate(self.entries)}
+
+    @cached_property
+    def sd(self) -> np.ndarray:
+        """(P,) prior standard deviations."""
+        return np.array([p.sd for p in self.entries])
+
+    @cached_property
+    def bound(self) -> np.ndarray:
+        """(P,) bounds of |θ|."""
+        return np.array([p.bound for p in self.entries])
+
+    @cached_property
+    def families(self) -> tuple[str, ...]:
+        """Families that have a parameter."""
+        return tuple(dict.fromkeys(p.family for p in self.entries))
+
+    @cached_property
+    def n_kinematic(self) -> int:
+        """K: how many of them, from the first, are parameters of the kinematics."""
+        return sum(p.family in KINEMATIC for p in self.entries)
+
+    def place(self, family: str, owner: str, component: str = "") -> int | None:
+        """Index in θ, None when it is no parameter."""
+        return self._places.get((family, owner, component))
+
+    def of_family(self, family: str) -> np.ndarray:
+        """Indices in θ of a family's parameters."""
+        return np.array([i for i, p in enumerate(self.entries) if p.family == family], dtype=int)
+
+
+def declare(
+    families: Iterable[str], skeleton: Skeleton, cameras: list[str], fps: float, widths: PriorWidths
+) -> Parameters:
+    """The parameters of some families for a skeleton and cameras, by name."""
+    chosen = check_families(families)
+    entries: list[Parameter] = []
+    if "scale" in chosen:
+        entries += [Parameter("scale", g, "", widths.scale, _REACH * widths.scale) for g in skeleton.groups]
+    if "offsets" in chosen:
+        entries += [
+            Parameter("offsets", marker, axis, widths.offset, _REACH * widths.offset)
+            for marker in skeleton.marker_names
+            for axis in "xyz"
+        ]
+    if "delay" in chosen:
+        sd = widths.delay / fps
+        entries += [Parameter("delay", camera, "", sd, _REACH_DELAY * sd) for camera in cameras[1:]]
+    if "extrinsics" in chosen:
+        for camera in cameras[1:]:
+            for component in POSE:
+                sd = widths.rotation if component.startswith("r") else widths.translation
+                entries.append(Parameter("extrinsics", camera, component, sd, _REACH * sd))
+    return Parameters(tuple(entries))
+
+
+def check_families(families: Iterable[str]) -> tuple[str, ...]:
+    """Families in their order, none twice.
+
+    Raises
+    ------
+    InputError
+        A name is none of :data:`FAMILIES`.
+    """
+    names = list(families)
+    for name in names:
+        if name not in FAMILIES:
+            raise InputError(
+                f"There is no family of parameters '{name}'{did_you_mean(name, FAMILIES)}",
+                key="fit",
+                expected=f"some of {', '.join(FAMILIES)}",
+                found=", ".join(names),
+            )
+    return tuple(f for f in FAMILIES if f in names)
+
+
+def rotation_vector(cayley: np.ndarray) -> np.ndarray:
+    """Rotation vector (…, 3), rad, of the Cayley vector ρ = 2 tan(φ/2)·axis that the problem uses."""
+    size = np.linalg.norm(cayley, axis=-1, keepdims=True)
+    return cayley * np.where(size > 0, 2 * np.arctan(size / 2) / np.where(size > 0, size, 1.0), 1.0)
+
+
+def cayley_matrix(rho: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a Cayley vector ρ (3,): I + ([ρ]× + ½[ρ]×²)/(1 + ρ²/4)."""
+    x, y, z = rho
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + (skew + 0.5 * skew @ skew) / (1 + 0.25 * float(rho @ rho))
+
+
+def describe(parameters: Parameters, theta: np.ndarray, sd: np.ndarray | None) -> dict[str, Any]:
+    """Values, and standard deviations under ``<family>_sd``, as :class:`~acino_fte.result.FTEResult` has them.
+
+    The first camera is listed with zeros. Scales are factors; their standard deviation is s·sd(λ).
+    """
+    result: dict[str, Any] = {}
+    for suffix, values in (("", theta), ("_sd", sd)):
+        if values is None:
+            continue
+        for name, family in _FAMILY_KEYS.items():
+            found = [
+                (p, float(v)) for p, v in zip(parameters.entries, values, strict=True) if p.family == family
+            ]
+            if not found:
+                continue
+            table: dict[str, Any] = {}
+            for p, v in found:
+                if family == "scale":
+                    factor = float(np.exp(theta[parameters.place("scale", p.owner)]))
+                    table[p.owner] = factor * v if suffix else factor
+                elif family == "delay":
+                    table[p.owner] = v
+                elif family == "offsets":
+                    table.setdefault(p.owner, []).append(v)
+                else:
+                    pose = table.setdefault(p.owner, {"rotation_rad": [], "translation_m": []})
+                    pose["translation_m" if p.component.startswith("t") else "rotation_rad"].append(v)
+            if family == "extrinsics" and not suffix:
+                for pose in table.values():
+                    pose["rotation_rad"] = rotation_vector(np.array(pose["rotation_rad"])).tolist()
+            result[name + suffix] = table
+    return result
+
+
+_FAMILY_KEYS = {
+    "segment_scale": "scale",
+    "marker_offset_m": "offsets",
+    "time_offset_s": "delay",
+    "extrinsics": "extrinsics",
+}
