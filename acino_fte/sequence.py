@@ -27,7 +27,10 @@ class Sequence:
         Frames per second.
     detections : xarray.Dataset
         ``position`` (frame, camera, marker, space = u, v), px, NaN where missing, and ``likelihood``
-        (frame, camera, marker). The coordinate ``frame`` counts from the start of the recording.
+        (frame, camera, marker). The coordinate ``frame`` counts from the start of the recording. Where the
+        detector gave several candidates for a marker also ``candidate_position`` (frame, camera, marker,
+        candidate, space), px, NaN where there are fewer, and ``candidate_likelihood`` (frame, camera,
+        marker, candidate), 0 where there are fewer; candidate 0 is ``position``.
     cameras : CameraArray
         In the order of the dimension ``camera``; moving cameras have one pose per frame of this range.
     truth : xarray.DataArray, optional
@@ -81,6 +84,19 @@ class Sequence:
         chosen = self.detections.reindex(marker=markers)
         position = chosen.position.transpose("frame", "camera", "marker", "space").values
         sure = chosen.likelihood.transpose("frame", "camera", "marker").values > likelihood
+        return np.where(sure[..., None] & np.isfinite(position).all(-1, keepdims=True), position, np.nan)
+
+    def candidates(self, markers: list[str], likelihood: float) -> np.ndarray | None:
+        """Candidates (N, C, M, K, 2) px of the given markers with a likelihood above a threshold, else NaN.
+
+        None when the detections have none. Candidate 0 is what :meth:`pixels` gives.
+        """
+        if "candidate_position" not in self.detections:
+            return None
+        chosen = self.detections.reindex(marker=markers)
+        dims = ("frame", "camera", "marker", "candidate")
+        position = chosen.candidate_position.transpose(*dims, "space").values
+        sure = chosen.candidate_likelihood.transpose(*dims).values > likelihood
         return np.where(sure[..., None] & np.isfinite(position).all(-1, keepdims=True), position, np.nan)
 
     def select_frames(self, start: int | None, stop: int | None) -> Sequence:

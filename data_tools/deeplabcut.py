@@ -1,4 +1,4 @@
-"""DeepLabCut tables of one animal: CSV and H5 in, CSV out."""
+"""Keypoint files of one animal: DeepLabCut's CSV and H5, tables of candidates; CSV out."""
 
 from __future__ import annotations
 
@@ -10,6 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from acino_fte.data_tools.deeplabcut_candidates import (
+    PICKLE_SUFFIXES,
+    is_candidate_table,
+    read_candidate_table,
+    read_full_pickle,
+)
 from acino_fte.data_tools.keypoints import COORDINATES, Keypoints, from_table
 from acino_fte.errors import InputError
 
@@ -19,7 +25,10 @@ _NOT_A_TABLE = "give the CSV or H5 file that DeepLabCut's analyze_videos wrote"
 
 
 def read_deeplabcut(path: Path | str) -> Keypoints:
-    """Read a DeepLabCut table; the ending of its name says whether it is CSV or H5.
+    """Read a keypoint file; the ending of its name says of which kind it is.
+
+    A DeepLabCut table (.csv, .h5), DeepLabCut's ``_full.pickle``, or a CSV of candidates (see
+    :mod:`acino_fte.data_tools.deeplabcut_candidates`).
 
     Returns
     -------
@@ -41,12 +50,16 @@ def read_deeplabcut(path: Path | str) -> Keypoints:
         from acino_fte.data_tools.deeplabcut_h5 import read_h5
 
         return from_table(*read_h5(path), path)
+    if path.suffix.lower() in PICKLE_SUFFIXES:
+        return read_full_pickle(path)
+    if path.suffix.lower() == ".csv" and is_candidate_table(path):
+        return read_candidate_table(path)
     if path.suffix.lower() == ".csv":
         return from_table(*_read_csv(path), path)
     raise InputError(
         "The keypoint file is of a kind that cannot be read.",
         file=path,
-        expected=f".csv or {', '.join(H5_SUFFIXES)}",
+        expected=f".csv or {', '.join((*H5_SUFFIXES, *PICKLE_SUFFIXES))}",
         found=path.suffix or "no ending",
         remedy=_NOT_A_TABLE,
     )

@@ -29,17 +29,36 @@ class Keypoints:
         The detector's confidence, 0 where missing.
     path : Path
         The file they come from.
+    candidate_position : (N, K, J, 2), optional
+        Where the file has several candidates for a body part: the J best, the first is `position`; NaN
+        where there are fewer.
+    candidate_likelihood : (N, K, J), optional
+        Their likelihoods, 0 where there are fewer.
     """
 
     names: tuple[str, ...]
     position: np.ndarray
     likelihood: np.ndarray
     path: Path
+    candidate_position: np.ndarray | None = None
+    candidate_likelihood: np.ndarray | None = None
 
     @property
     def n_frames(self) -> int:
         """N."""
         return len(self.position)
+
+    @property
+    def depth(self) -> int:
+        """J; 1 without candidates."""
+        return 1 if self.candidate_position is None else self.candidate_position.shape[2]
+
+    @property
+    def candidates(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position (N, K, J, 2) and likelihood (N, K, J) of all candidates, J = 1 without any."""
+        if self.candidate_position is None or self.candidate_likelihood is None:
+            return self.position[:, :, None], self.likelihood[:, :, None]
+        return self.candidate_position, self.candidate_likelihood
 
     @property
     def x(self) -> np.ndarray:
@@ -85,6 +104,21 @@ def from_table(
     full = np.full((frame.max() + 1, len(names), 3), np.nan)
     full[frame] = values[:, order].reshape(len(values), len(names), 3)
     position, likelihood = full[..., :2], full[..., 2]
+    check_likelihood(likelihood, path)
+    missing = ~np.isfinite(full).all(-1) | (position == 0).all(-1) | (likelihood < 0)
+    return Keypoints(
+        names, np.where(missing[..., None], np.nan, position), np.where(missing, 0.0, likelihood), path
+    )
+
+
+def check_likelihood(likelihood: np.ndarray, path: Path) -> None:
+    """Likelihoods are probabilities, NaN where missing.
+
+    Raises
+    ------
+    InputError
+        Some are far above 1.
+    """
     highest = float(np.nanmax(likelihood, initial=0.0))
     if highest > _MAX_LIKELIHOOD:
         raise InputError(
@@ -95,10 +129,6 @@ def from_table(
             found=f"up to {highest:g}",
             remedy="divide them by 100 if they are percentages; check that the columns are not shifted",
         )
-    missing = ~np.isfinite(full).all(-1) | (position == 0).all(-1) | (likelihood < 0)
-    return Keypoints(
-        names, np.where(missing[..., None], np.nan, position), np.where(missing, 0.0, likelihood), path
-    )
 
 
 def _check_columns(columns: Sequence[tuple[str, str]], names: tuple[str, ...], path: Path) -> None:

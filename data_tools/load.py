@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -194,16 +194,26 @@ def _detections(keypoints: dict[str, Keypoints], skeleton: Skeleton) -> tuple[xr
     markers = [m for m in skeleton.marker_names if m in found]
     warnings += checks.check_lengths(keypoints)
     n_frames = max(k.n_frames for k in keypoints.values())
-    position = np.full((n_frames, len(keypoints), len(markers), 2), np.nan)
-    likelihood = np.zeros(position.shape[:3])
+    depth = max(k.depth for k in keypoints.values())
+    position = np.full((n_frames, len(keypoints), len(markers), depth, 2), np.nan)
+    likelihood = np.zeros(position.shape[:4])
     for c, (camera, table) in enumerate(keypoints.items()):
         columns = [table.names.index(name) for name in matches[camera]]
         places = [markers.index(marker) for marker in matches[camera].values()]
-        position[: table.n_frames, c, places] = table.position[:, columns]
-        likelihood[: table.n_frames, c, places] = table.likelihood[:, columns]
+        points, chances = table.candidates
+        position[: table.n_frames, c, places, : table.depth] = points[:, columns]
+        likelihood[: table.n_frames, c, places, : table.depth] = chances[:, columns]
     dims = ("frame", "camera", "marker")
+    units = {"units": "px"}
+    variables: dict[str, Any] = {
+        "position": ((*dims, "space"), position[:, :, :, 0].copy(), units),
+        "likelihood": (dims, likelihood[:, :, :, 0].copy()),
+    }
+    if depth > 1:
+        variables["candidate_position"] = ((*dims, "candidate", "space"), position, units)
+        variables["candidate_likelihood"] = ((*dims, "candidate"), likelihood)
     return xr.Dataset(
-        {"position": ((*dims, "space"), position, {"units": "px"}), "likelihood": (dims, likelihood)},
+        variables,
         coords={
             "frame": np.arange(n_frames),
             "camera": list(keypoints),

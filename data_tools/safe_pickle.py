@@ -1,7 +1,9 @@
 """Pickles inside other tools' files, read so that they can hold data and nothing else.
 
 A pickle is a program: it may name any function and have it called. Here only the names of containers,
-numbers, text and of NumPy's and pandas' data classes are let through.
+numbers, text and of NumPy's and pandas' data classes are let through. The lists and numbers of ruamel.yaml,
+which DeepLabCut copies from its configuration into its results, become plain ones by classes that stand in
+for its own; the library itself is never looked up.
 """
 
 from __future__ import annotations
@@ -55,8 +57,39 @@ class _Forbidden(pickle.UnpicklingError):
     """The pickle names something that is not data."""
 
 
+class _Inert:
+    """Takes the place of a class of ruamel.yaml; whatever it is given besides its value is forgotten."""
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+
+class _List(_Inert, list):
+    pass
+
+
+class _Dict(_Inert, dict):
+    pass
+
+
+class _Float(_Inert, float):
+    pass
+
+
+class _Int(_Inert, int):
+    pass
+
+
+_STAND_INS: dict[str, type] = {
+    **{"CommentedSeq": _List, "CommentedMap": _Dict, "ScalarFloat": _Float, "ScalarInt": _Int},
+    **dict.fromkeys(("Format", "LineCol", "Comment", "CommentToken", "StringMark", "FileMark"), _Inert),
+}
+
+
 class _DataUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
+        if module.startswith("ruamel.yaml.") and name in _STAND_INS:
+            return _STAND_INS[name]
         if (module, name) not in ALLOWED:
             raise _Forbidden(f"{module}.{name}")
         return super().find_class(module, name)

@@ -26,7 +26,9 @@ class SequenceFile(BaseModel):
     fps: float | None = Field(None, gt=0, description="frames per second")
     cameras: str = Field(description="camera file: cameras.json, an AcinoSet scene, or Anipose's TOML")
     camera_unit: Literal["m", "cm", "mm"] = Field("m", description="unit of the translations in that file")
-    keypoints: dict[str, str] = Field(min_length=1, description="keypoint file (.csv or .h5) by camera name")
+    keypoints: dict[str, str] = Field(
+        min_length=1, description="keypoint file (.csv, .h5, .pickle) by camera name"
+    )
     frames: tuple[int, int] | None = Field(None, description="start and stop, half-open, counted from 0")
     truth: str | None = Field(None, description="CSV with frame, marker, x, y, z (m) where they are known")
 
