@@ -58,7 +58,9 @@ class Slot:
     nodes : tuple of Node
         Of a position: one, or those of its stencil.
     delay : (K,), optional
-        Parameter that says how late; ``newest`` (K,) is the newest frame of the stencil.
+        Of a position at t + τ: the parameter τ; ``newest`` (K,) is the newest frame of the stencil.
+    delay_of : Slot, optional
+        Of a parameter τ: the position that it moves in time.
     """
 
     kind: str
@@ -70,6 +72,7 @@ class Slot:
     nodes: tuple[Node, ...] = ()
     delay: np.ndarray | None = None
     newest: np.ndarray | None = None
+    delay_of: Slot | None = None
 
     @cached_property
     def item(self) -> int | None:
@@ -116,7 +119,7 @@ class CompiledTerm:
         self.size = len(term)
         self.n_local = lowered.n_variables
         self.slots: list[Slot] = []
-        late: list[Slot] = []
+        late: list[tuple[int, np.ndarray, slice, int]] = []
         start = 0
         for source in lowered.inputs:
             rows = slice(start, start + width(source))
@@ -127,13 +130,16 @@ class CompiledTerm:
             if source.delay is not None:
                 shift, newest = term.items[:, source.delay], delay.stencil(frames, n_frames)
                 place = slice(self.n_local + len(late), self.n_local + len(late) + 1)
-                late.append(Slot("parameter", source.delay, 0, term.frames, shift, place))
+                late.append((source.delay, shift, place, len(self.slots)))
             if source.kind == "position":
                 nodes = tuple(_nodes(frames, newest, items, n_frames, n_markers))
             self.slots.append(
                 Slot(source.kind, source.item, source.lag, frames, items, rows, nodes, shift, newest)
             )
-        self.slots += late
+        self.slots += [
+            Slot("parameter", column, 0, term.frames, shift, place, delay_of=self.slots[owner])
+            for column, shift, place, owner in late
+        ]
         self.n_variables = self.n_local + len(late)
 
     @property
@@ -241,11 +247,10 @@ class CompiledTerm:
             for other, (i, blend) in enumerate(found.blends.items(), start=n):
                 local[other, row] += (column[self.slots[i].rows] * blend.velocity).sum(0)
 
-    def mixed(self, found: Evaluation, pull: np.ndarray) -> Iterator[tuple[Slot, Slot, np.ndarray]]:
-        """∂w_k/∂τ ∂E/∂p̃ per delayed position: its slot, that of τ, and values (nodes, 3, K)."""
-        for row, (i, blend) in enumerate(found.blends.items(), start=self.n_local):
-            late = next(s for s in self.slots if s.rows.start == row)
-            yield self.slots[i], late, blend.slopes[:, None] * pull[self.slots[i].rows]
+    def mixed(self, found: Evaluation, slot: Slot, pull: np.ndarray) -> np.ndarray | None:
+        """∂w_k/∂τ ∂E/∂p̃ of a delayed position, (nodes, 3, K); None of any other."""
+        blend = found.blends.get(self.slots.index(slot))
+        return None if blend is None else blend.slopes[:, None] * pull[slot.rows]
 
     def weight(self, found: Evaluation, slot: Slot, node: Node) -> np.ndarray | float:
         """Share of a node in a position: 1, or the weight in its stencil (K,)."""

@@ -4,6 +4,7 @@ Variables, indexed by frame number, ``link.dof``, marker and camera name:
 
     x, dx, ddx[frame, dof]            state and its derivatives
     position[frame, marker, axis]     marker positions, m
+    parameter[name]                   global parameters, by name: 'delay.cam2', 'scale.neck', …
     slack_model[frame, dof, 'w']      jump of acceleration
     slack_meas[frame, marker, camera, 'u' | 'v']      reprojection residual, px
     slack_<family>[…]                 residuals of any other term
@@ -29,6 +30,7 @@ import numpy as np
 import pyomo.environ as pyo
 from pyomo.core.expr import Expr_if
 
+from acino_fte import delay
 from acino_fte.codegen import FUNCTIONS
 from acino_fte.errors import InputError
 from acino_fte.problem import FTEProblem
@@ -38,15 +40,18 @@ from acino_fte.terms import Term
 _PYOMO: dict[str, Callable] = {f: getattr(pyo, f) for f in FUNCTIONS if hasattr(pyo, f)}
 
 
-def build_explicit(problem: FTEProblem, start: np.ndarray) -> pyo.ConcreteModel:
-    """State a problem as a Pyomo model, initialised at q (N, Q). Nothing is solved."""
+def build_explicit(
+    problem: FTEProblem, start: np.ndarray, theta: np.ndarray | None = None
+) -> pyo.ConcreteModel:
+    """State a problem as a Pyomo model, initialised at q (N, Q) and θ (P,). Nothing is solved."""
     model = pyo.ConcreteModel("full trajectory estimation")
     skeleton = problem.kinematics.skeleton
     model.FRAMES = pyo.Set(initialize=[int(f) for f in problem.frames], ordered=True)
     model.DOFS = pyo.Set(initialize=skeleton.dof_names, ordered=True)
     model.MARKERS = pyo.Set(initialize=skeleton.marker_names, ordered=True)
     model.AXES = pyo.Set(initialize=AXES, ordered=True)
-    point = _Point.at(problem, start)
+    point = _Point.at(problem, start, np.zeros(len(problem.parameters)) if theta is None else theta)
+    _add_parameters(model, problem, point)
     _add_states(model, problem, point)
     _add_kinematics(model, problem, point)
     model.cost = pyo.Expression(pyo.Any)
@@ -61,15 +66,16 @@ def build_explicit(problem: FTEProblem, start: np.ndarray) -> pyo.ConcreteModel:
 
 @dataclass(frozen=True)
 class _Point:
-    """Numbers that the model starts from: states (N, Q) and positions (N, M, 3)."""
+    """Numbers that the model starts from: states (N, Q), positions (N, M, 3) and parameters (P,)."""
 
     x: np.ndarray
     dx: np.ndarray
     ddx: np.ndarray
     position: np.ndarray
+    theta: np.ndarray
 
     @classmethod
-    def at(cls, problem: FTEProblem, start: np.ndarray) -> _Point:
+    def at(cls, problem: FTEProblem, start: np.ndarray, theta: np.ndarray) -> _Point:
         """Derivatives by backward differences; those of the first frames continue what follows."""
         x = problem.clip(start)
         dx = np.diff(x, axis=0, prepend=x[:1]) / problem.dt
@@ -77,12 +83,23 @@ class _Point:
         if len(x) > 2:
             ddx[:2] = ddx[2]
             dx[0] = dx[1] - problem.dt * ddx[1]
-        return cls(x, dx, ddx, problem.kinematics.positions(x))
+        positions = problem.kinematics.positions(x, problem.proportions(theta))
+        return cls(x, dx, ddx, positions, theta)
 
     def residuals(self, problem: FTEProblem, term: Term) -> np.ndarray:
         """Residuals of a term at this point, (components, K)."""
         inputs: list[np.ndarray | float] = []
         for handle in term.residual.handles:
+            if handle.kind == "parameter":
+                inputs.append(self.theta[term.items[:, handle.item]])
+                continue
+            if handle.delay is not None:
+                newest = delay.stencil(term.frames, problem.n_frames)
+                late = self.theta[term.items[:, handle.delay]] / problem.dt
+                weights = delay.weights(late - (newest - term.frames))[0]
+                nodes = self.position[newest - np.arange(delay.NODES)[:, None], term.items[:, handle.item]]
+                inputs += list(np.einsum("nk,nka->ak", weights, nodes))
+                continue
             source = {"dof": self.x, "velocity": self.dx, "acceleration": self.ddx, "position": self.position}
             value = source[handle.kind][term.frames - handle.lag, term.items[:, handle.item]]
             inputs += list(value.T) if handle.kind == "position" else [value]
@@ -90,6 +107,18 @@ class _Point:
         out = np.empty((len(term.residual.components), len(term)))
         residual_program(term.residual).numpy_function(inputs, out)
         return out
+
+
+def _add_parameters(model: pyo.ConcreteModel, problem: FTEProblem, point: _Point) -> None:
+    """The global parameters θ, within their bounds."""
+    names = problem.parameters.names
+    reach = dict(zip(names, problem.parameters.bound.tolist(), strict=True))
+    model.PARAMETERS = pyo.Set(initialize=names, ordered=True)
+    model.parameter = pyo.Var(
+        model.PARAMETERS,
+        bounds=lambda m, name: (-reach[name], reach[name]),
+        initialize=dict(zip(names, point.theta.tolist(), strict=True)),
+    )
 
 
 def _add_states(model: pyo.ConcreteModel, problem: FTEProblem, point: _Point) -> None:
@@ -127,8 +156,9 @@ def _add_kinematics(model: pyo.ConcreteModel, problem: FTEProblem, point: _Point
     model.position = pyo.Var(model.FRAMES, model.MARKERS, model.AXES)
     model.shared = pyo.Expression(pyo.Any)
     model.kinematics = pyo.Constraint(model.FRAMES, model.MARKERS, model.AXES)
+    proportions = dict(zip(program.inputs[len(dofs) :], model.parameter.values(), strict=False))
     for n, f in enumerate(model.FRAMES):
-        values = {f"q_{j}": model.x[f, d] for j, d in enumerate(dofs)}
+        values = {f"q_{j}": model.x[f, d] for j, d in enumerate(dofs)} | proportions
         results = program.run(values, _PYOMO, _Named(model.shared, f))
         for i, result in enumerate(results):
             key = (f, markers[i // 3], AXES[i % 3])
@@ -194,23 +224,50 @@ def _instances(
     frames = list(model.FRAMES)
     names = input_names(term.residual)
     kinds = {handle.item: handle.kind for handle in term.residual.handles}
+    named = [i for i, kind in kinds.items() if kind != "parameter"] or [0]  # what tells instances apart
+    sets = {"position": model.MARKERS, "parameter": model.PARAMETERS}
     for k in range(len(term)):
         n, items = int(term.frames[k]), term.items[k]
         inputs: list[Any] = []
         for handle in term.residual.handles:
-            inputs += _handle_values(model, handle, frames[n - handle.lag], int(items[handle.item]))
+            if handle.delay is not None:
+                inputs += _delayed(model, problem, n, items, handle)
+            else:
+                inputs += _handle_values(model, handle, frames[n - handle.lag], int(items[handle.item]))
         data = [term.data[name] for name in term.residual.data]
         inputs += [problem.dt, *(float(v[k]) if isinstance(v, np.ndarray) else v for v in data)]
-        labels = [
-            (model.MARKERS if kinds[i] == "position" else model.DOFS).at(int(item) + 1)
-            for i, item in enumerate(items)
-        ]
+        labels = [sets.get(kinds[i], model.DOFS).at(int(items[i]) + 1) for i in named]
         key = (frames[n], *labels, *([term.label] if term.label else []))
         yield key, dict(zip(names, inputs, strict=True))
 
 
+def _delayed(
+    model: pyo.ConcreteModel, problem: FTEProblem, n: int, items: np.ndarray, handle: Handle
+) -> list[Any]:
+    """A marker's position at t + τ (:mod:`acino_fte.delay`), one expression for each camera, marker, frame."""
+    newest = int(delay.stencil(np.array(n), problem.n_frames))
+    late = model.PARAMETERS.at(int(items[handle.delay]) + 1)
+    marker, frame = model.MARKERS.at(int(items[handle.item]) + 1), model.FRAMES.at(n + 1)
+    behind = newest - n
+    if (late, behind) not in model.shared:
+        u = model.parameter[late] / problem.dt - behind
+        weights = delay.programs()["weights"].run({"u": u}, _PYOMO)
+        for node, weight in enumerate(weights):
+            model.shared[late, behind, node] = weight
+        model.shared[late, behind] = u
+    frames = [model.FRAMES.at(newest - node + 1) for node in range(delay.NODES)]
+    values = []
+    for a in AXES:
+        nodes = (model.shared[late, behind, i] * model.position[f, marker, a] for i, f in enumerate(frames))
+        model.shared[late, frame, marker, a] = pyo.quicksum(nodes)
+        values.append(model.shared[late, frame, marker, a])
+    return values
+
+
 def _handle_values(model: pyo.ConcreteModel, handle: Handle, frame: int, item: int) -> list[Any]:
     """The model's variables behind a handle."""
+    if handle.kind == "parameter":
+        return [model.parameter[model.PARAMETERS.at(item + 1)]]
     if handle.kind == "position":
         marker = model.MARKERS.at(item + 1)
         return [model.position[frame, marker, a] for a in AXES]
@@ -221,3 +278,8 @@ def _handle_values(model: pyo.ConcreteModel, handle: Handle, frame: int, item: i
 def read_states(model: pyo.ConcreteModel) -> np.ndarray:
     """x of a solved model as q (N, Q)."""
     return np.array([[pyo.value(model.x[f, d]) for d in model.DOFS] for f in model.FRAMES])
+
+
+def read_parameters(model: pyo.ConcreteModel) -> np.ndarray:
+    """θ (P,) of a solved model."""
+    return np.array([pyo.value(model.parameter[name]) for name in model.PARAMETERS])

@@ -18,7 +18,7 @@ from pyomo.core.expr import numeric_expr as ne
 from pyomo.core.expr import relational_expr as re
 
 from acino_fte.errors import InputError
-from acino_fte.explicit import build_explicit, read_states
+from acino_fte.explicit import build_explicit, read_parameters, read_states
 from acino_fte.problem import FTEProblem
 from acino_fte.result import Status
 from acino_fte.solve import IPOPT_STATUS, Minimum, Progress, SolveOptions, check_linear_solver
@@ -44,9 +44,10 @@ def minimise_explicit(
     options: SolveOptions | None = None,
     progress: Progress | None = None,
     route: str | None = None,
+    theta: np.ndarray | None = None,
 ) -> Minimum:
-    """Build the explicit model at q (N, Q) and solve it; ``route`` overrides the choice of solver."""
-    model = build_explicit(problem, start)
+    """Build the explicit model at q (N, Q) and θ (P,) and solve it; ``route`` overrides the choice of solver."""
+    model = build_explicit(problem, start, theta)
     return solve_explicit(model, problem, options, progress, route)
 
 
@@ -68,7 +69,8 @@ def solve_explicit(
         raise InputError(f"There is no solve route '{route}'.", expected=", ".join(ROUTES))
     check_linear_solver(status, iterations, options)
     q = np.clip(read_states(model), problem.lower, problem.upper)
-    return Minimum(status, q, float(pyo.value(model.objective)), iterations)
+    theta = np.clip(read_parameters(model), -problem.parameters.bound, problem.parameters.bound)
+    return Minimum(status, q, float(pyo.value(model.objective)), iterations, theta)
 
 
 def available_route() -> str:

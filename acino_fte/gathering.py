@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from acino_fte.compiled_terms import CompiledTerm, Evaluation, Slot
+from acino_fte.compiled_terms import CompiledTerm, Evaluation, Node, Slot
 from acino_fte.kinematic_curvature import kinematic_curvature
 from acino_fte.kinematics import Linearised
 from acino_fte.problem import FTEProblem
@@ -190,7 +190,7 @@ class _Sums:
         self.border = np.zeros((n, d, p))
         self.corner = np.zeros((p, p))
         self.inner: dict[int, np.ndarray] = {}  # lag → (N·M, 9): ∂²E/∂p(n)∂p(n − lag) of one marker
-        self.outer = np.zeros((n * m, 3, p - self.n_kinematic))  # ∂²E/∂p∂θ for θ beyond the kinematics
+        self.outer: dict[tuple[int, ...], np.ndarray] = {}  # places in θ → (N·M, 3, places): ∂²E/∂p∂θ
 
     def add(self, term: CompiledTerm, found: Evaluation, pull: np.ndarray, *, exact: bool) -> None:
         """Add the Hessian of one term."""
@@ -201,15 +201,8 @@ class _Sums:
                 kinds = (first.kind, second.kind)
                 if kinds == ("position", "position") and first.column == second.column:
                     self._positions(term, found, first, second, part)
-                elif kinds == ("position", "parameter"):
-                    for node in first.nodes:
-                        weighted = part[:, 0] * term.weight(found, first, node)
-                        self._position_parameter(node.scatter, second, weighted)
                 elif kinds == ("parameter", "parameter"):
-                    if first.item is not None and second.item is not None:
-                        self.corner[first.item, second.item] += part[0, 0].sum()
-                    else:
-                        np.add.at(self.corner, (first.items, second.items), part[0, 0])
+                    _add_at(self.corner, first, second, part[0, 0])
                 elif kinds == ("dof", "parameter"):
                     np.add.at(self.border, (first.frames, first.items, second.items), part[0, 0])
                 elif kinds == ("dof", "dof") and second.lag >= first.lag:
@@ -217,28 +210,60 @@ class _Sums:
                     np.add.at(self.blocks[second.lag - first.lag], cells, part[0, 0])
                 elif "position" in kinds and "parameter" not in kinds:
                     self._general(first, second, part)
-        if exact:
-            for slot, late, values in term.mixed(found, pull):
-                for node, value in zip(slot.nodes, values, strict=True):
-                    self._position_parameter(node.scatter, late, value)
+        late = [slot for slot in term.slots if slot.kind == "parameter"]
+        for slot in term.slots:
+            if slot.kind == "position" and late:
+                extra = term.mixed(found, slot, pull) if exact else None
+                self._position_parameters(term, found, slot, late, local, extra)
 
     def _positions(
         self, term: CompiledTerm, found: Evaluation, first: Slot, second: Slot, part: np.ndarray
     ) -> None:
-        flat = part.reshape(9, -1)
+        flat = np.ascontiguousarray(part.reshape(9, -1).T)
         for a in first.nodes:
             for b in second.nodes:
                 lag = int(a.frames[0] - b.frames[0])
                 if lag >= 0:
                     weight = term.weight(found, first, a) * term.weight(found, second, b)
-                    total = a.scatter @ (flat * weight).T
+                    total = a.scatter @ (flat * np.reshape(weight, (-1, 1)))
                     self.inner[lag] = self.inner[lag] + total if lag in self.inner else total
 
-    def _position_parameter(self, scatter, slot: Slot, values: np.ndarray) -> None:
-        """Add ∂²E/∂p∂θ, values (3, K)."""
-        for item in [slot.item] if slot.item is not None else np.unique(slot.items).tolist():
-            chosen = values if slot.item is not None else np.where(slot.items == item, values, 0.0)
-            self.outer[:, :, item - self.n_kinematic] += scatter @ chosen.T
+    def _position_parameters(
+        self,
+        term: CompiledTerm,
+        found: Evaluation,
+        slot: Slot,
+        others: list[Slot],
+        local: np.ndarray,
+        extra: np.ndarray | None,
+    ) -> None:
+        """Add ∂²E/∂p∂θ of a position and all parameters of a term.
+
+        ``extra`` (nodes, 3, K) is what the weights of a delayed position add in the column of its τ.
+        """
+        rows = [other.rows.start for other in others]
+        stacked = np.ascontiguousarray(np.moveaxis(local[slot.rows][:, rows], -1, 0))  # (K, 3, p)
+        late = next((i for i, o in enumerate(others) if o.delay_of is slot), None)
+        for place, node in enumerate(slot.nodes):
+            values = stacked * np.reshape(term.weight(found, slot, node), (-1, 1, 1))
+            if extra is not None and late is not None:
+                values[:, :, late] += extra[place].T
+            self._outer(node, others, values)
+
+    def _outer(self, node: Node, others: list[Slot], values: np.ndarray) -> None:
+        """Add values (K, 3, p) of a node and p parameters to what has been gathered for positions."""
+        fixed = [other.item for other in others if other.item is not None]
+        shape = (self.whole.shape[0] * self.whole.n_markers, 3)
+        if len(fixed) == len(others):
+            total = (node.scatter @ values.reshape(len(values), -1)).reshape(*shape, len(fixed))
+            key = tuple(fixed)
+            self.outer[key] = self.outer[key] + total if key in self.outer else total
+            return
+        for i, other in enumerate(others):
+            for item in np.unique(other.items).tolist():
+                chosen = np.where((other.items == item)[:, None], values[:, :, i], 0.0)
+                total = (node.scatter @ chosen)[..., None]
+                self.outer[(item,)] = self.outer[(item,)] + total if (item,) in self.outer else total
 
     def _general(self, first: Slot, second: Slot, part: np.ndarray) -> None:
         """Two markers, or a marker and a degree of freedom, of one residual: every instance by itself."""
@@ -279,19 +304,18 @@ class _Sums:
 
     def carried(self) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """A, B and D with what was gathered for positions carried to q and θ."""
-        if self.linear is None or not (self.inner or self.outer.size):
+        if self.linear is None or not (self.inner or self.outer):
             return self.blocks, self.border, self.corner
         (n, d), m, k = self.whole.shape, self.whole.n_markers, self.n_kinematic
         curvature = {lag: v.reshape(n, m, 3, 3) for lag, v in self.inner.items()}
-        outer = self.outer.reshape(n, m, 3, -1)
         for lag, values in curvature.items():
             self._band(lag, values)
-        if self.border.shape[-1] > k:
-            jacobian = self.linear.jacobian.reshape(n, 3 * m, d)
-            self.border[:, :, k:] += jacobian.transpose(0, 2, 1) @ outer.reshape(n, 3 * m, -1)
+        jacobian = self.linear.jacobian.reshape(n, 3 * m, d).transpose(0, 2, 1)
+        for places, values in self.outer.items():
+            self.border[:, :, list(places)] += jacobian @ values.reshape(n, 3 * m, -1)
         if k:
-            self._scales(curvature, outer)
-            self._offsets(curvature, outer)
+            self._scales(curvature)
+            self._offsets(curvature)
         return self.blocks, self.border, self.corner
 
     def _band(self, lag: int, values: np.ndarray) -> None:
@@ -317,7 +341,7 @@ class _Sums:
                 result[:-lag] += values[lag:].swapaxes(-1, -2) @ fields[lag:]
         return result
 
-    def _scales(self, curvature: dict[int, np.ndarray], outer: np.ndarray) -> None:
+    def _scales(self, curvature: dict[int, np.ndarray]) -> None:
         assert self.linear is not None
         growth = self.linear.growth
         n, m, _, g = growth.shape
@@ -329,12 +353,13 @@ class _Sums:
         self.border[:, :, :g] += jacobian.transpose(0, 2, 1) @ applied.reshape(n, 3 * m, g)
         flat = growth.reshape(-1, g)
         self.corner[:g, :g] += flat.T @ applied.reshape(-1, g)
-        self._corner(slice(0, g), slice(k, None), flat.T @ outer.reshape(len(flat), -1))
+        for places, values in self.outer.items():
+            self._corner(np.arange(g), places, flat.T @ values.reshape(len(flat), -1))
         if k > g:
-            turned = np.einsum("nmab,nmag->mbg", self.linear.rotations, applied, optimize=True)
-            self._corner(slice(g, k), slice(0, g), turned.reshape(3 * m, g))
+            turned = (self.linear.rotations.swapaxes(-1, -2) @ applied).sum(0)
+            self._corner(np.arange(g, k), tuple(range(g)), turned.reshape(3 * m, g))
 
-    def _offsets(self, curvature: dict[int, np.ndarray], outer: np.ndarray) -> None:
+    def _offsets(self, curvature: dict[int, np.ndarray]) -> None:
         assert self.linear is not None
         turned = self.linear.rotations
         if not turned.shape[1]:
@@ -344,16 +369,25 @@ class _Sums:
         applied = self._applied(curvature, turned)
         mixed = self.linear.jacobian.swapaxes(-1, -2) @ applied  # (N, M, Q, 3)
         self.border[:, :, g:k] += mixed.transpose(0, 2, 1, 3).reshape(n, d, 3 * m)
-        own = np.einsum("nmab,nmac->mbc", turned, applied)
+        own = (turned.swapaxes(-1, -2) @ applied).sum(0)
         for i in range(m):
             part = slice(g + 3 * i, g + 3 * i + 3)
             self.corner[part, part] += own[i]
-        cross = np.einsum("nmab,nmap->mbp", turned, outer, optimize=True).reshape(3 * m, -1)
-        self._corner(slice(g, k), slice(k, None), cross)
+        for places, values in self.outer.items():
+            cross = (turned.swapaxes(-1, -2) @ values.reshape(n, m, 3, -1)).sum(0)
+            self._corner(np.arange(g, k), places, cross.reshape(3 * m, -1))
 
-    def _corner(self, rows: slice, columns: slice, values: np.ndarray) -> None:
-        self.corner[rows, columns] += values
-        self.corner[columns, rows] += values.T
+    def _corner(self, rows: np.ndarray, columns: tuple[int, ...], values: np.ndarray) -> None:
+        self.corner[np.ix_(rows, columns)] += values
+        self.corner[np.ix_(columns, rows)] += values.T
+
+
+def _add_at(matrix: np.ndarray, row: Slot, column: Slot, values: np.ndarray) -> None:
+    """Add values (K,) at the items of two slots; in one go where all instances have the same items."""
+    if row.item is not None and column.item is not None:
+        matrix[row.item, column.item] += values.sum()
+    else:
+        np.add.at(matrix, (row.items, column.items), values)
 
 
 def _lags(first: Slot, second: Slot) -> list[int]:

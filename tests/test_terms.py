@@ -178,7 +178,7 @@ def test_a_guard_takes_the_instance_out_of_reach(lizard, base):
 
 def test_lowered_variables(lizard):
     assert lower(SPIN).inputs == (Handle("dof"), Handle("dof", 1), Handle("dof", 2))
-    assert lower(CONTACT).inputs == (("position", 0, 0), ("position", 1, 0))
+    assert lower(CONTACT).inputs == (Handle("position"), Handle("position", 1))
     assert [lower(r).linear for r in (BONE, SYMMETRY, CONTACT, SPIN, LEAN)] == [
         False,
         True,
