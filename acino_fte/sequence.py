@@ -35,6 +35,9 @@ class Sequence:
         In the order of the dimension ``camera``; moving cameras have one pose per frame of this range.
     truth : xarray.DataArray, optional
         True marker positions (frame, marker, space = x, y, z), m, when known.
+    ground : tuple of float, optional
+        The plane that the animal stands on, when it is known: a, b, c, d with a x + b y + c z = d in the
+        world frame, m; (a, b, c) is a unit vector that points upwards.
     provenance : dict
         The sequence as it was understood, ready to be written as ``sequence.yaml``.
     warnings : tuple of str
@@ -47,6 +50,7 @@ class Sequence:
     detections: xr.Dataset
     cameras: CameraArray
     truth: xr.DataArray | None = None
+    ground: tuple[float, float, float, float] | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 

@@ -104,6 +104,8 @@ class Skeleton:
         Frame rate (Hz) that the process noise of the DOF is stated at.
     groups : tuple of str
         Names of the segment groups: the lengths of a group's links have one scale in common.
+    contacts : tuple of int
+        Markers that touch the ground when the animal stands, in the order of the markers.
     """
 
     name: str
@@ -115,6 +117,7 @@ class Skeleton:
     twins: tuple[tuple[str, str], ...] = ()
     noise_fps: float = 120.0
     groups: tuple[str, ...] = ()
+    contacts: tuple[int, ...] = ()
     source: str = ""
     path: Path | None = field(default=None, compare=False)
 
@@ -239,6 +242,7 @@ def expand(species: SpeciesFile, path: Path | None = None) -> Skeleton:
         twins=tuple(whole.marker_twins.items()),
         noise_fps=species.noise_fps,
         groups=groups,
+        contacts=_contacts(species, whole),
         source=species.source,
         path=path,
     )
@@ -267,6 +271,13 @@ def _groups(species: SpeciesFile, whole: Mirrored) -> tuple[tuple[str, ...], dic
     return names, {name: names.index(group) for name, group in group_of.items()}
 
 
+def _contacts(species: SpeciesFile, whole: Mirrored) -> tuple[int, ...]:
+    """Indices of the markers that touch the ground; twins touch it with their originals."""
+    original = {twin: name for name, twin in whole.marker_twins.items()}
+    touching = {original.get(name, name) for name in species.contacts}
+    return tuple(i for i, name in enumerate(whole.markers) if original.get(name, name) in touching)
+
+
 def deformed(
     skeleton: Skeleton,
     scales: Mapping[str, float] | None = None,
@@ -276,6 +287,8 @@ def deformed(
 
     Parameters
     ----------
+    skeleton : Skeleton
+        The species.
     scales : dict, optional
         Factor on the lengths of a segment group, by its name.
     offsets : dict, optional

@@ -32,6 +32,7 @@ def structure_faults(species: SpeciesFile, mirrored: Mirrored | None = None) -> 
         *_marker_links(whole),
         *_pairs(species, whole.markers),
         *_groups(species, whole),
+        *_contacts(species, whole),
         *_order(species, whole),
         *_aliases(whole),
     ]
@@ -132,6 +133,17 @@ def _groups(species: SpeciesFile, whole: Mirrored) -> Iterator[Fault]:
                 f"groups.{group}",
                 f"The group '{group}' is named like a link that is not in it.",
                 remedy="give the group another name",
+            )
+
+
+def _contacts(species: SpeciesFile, whole: Mirrored) -> Iterator[Fault]:
+    for name in species.contacts:
+        if name not in whole.markers:
+            yield Fault(
+                "contacts",
+                f"'{name}' is no marker{did_you_mean(name, whole.markers)}",
+                expected=f"one of {', '.join(whole.markers)}",
+                remedy="mend the name, or declare the marker",
             )
 
 

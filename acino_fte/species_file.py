@@ -113,6 +113,10 @@ class SpeciesFile(_Strict):
         description="links whose lengths are estimated together (--fit scale); twins are included, and "
         "every link that is not named makes a group of its own",
     )
+    contacts: list[str] = Field(
+        default_factory=list,
+        description="markers that touch the ground when the animal stands; twins are included",
+    )
     order: list[str] | None = Field(
         None, description="order of the state vector (link.dof); by default that of the file"
     )

@@ -109,6 +109,15 @@ markers:
   l_ankle: {link: l_back_foot, sd_px: 4, mirror: r_ankle}
   l_back_paw: {link: l_back_foot, at: [0, 0, -0.1], sd_px: 3.5, mirror: r_back_paw}
 
+# Links whose lengths are estimated together, by one factor for each group ('--fit scale'). A link that is
+# not named here makes a group of its own; the right side shares the factor of the left.
+groups:
+  front_leg: [l_upper_arm, l_forearm, l_front_foot]
+  back_leg: [l_thigh, l_shank, l_back_foot]
+
+# Markers that touch the ground when the animal stands; the right side does with the left.
+contacts: [l_front_paw, l_back_paw]
+
 # Lines of the pictures; the right side is drawn by mirroring.
 draw:
   - [nose, l_eye]

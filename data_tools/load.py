@@ -83,6 +83,7 @@ def load_sequence(
         detections=detections,
         cameras=cameras,
         truth=truth,
+        ground=file.ground.plane if file.ground else None,
         provenance={**file.to_dict(), "name": name},
         warnings=tuple(warnings),
     )

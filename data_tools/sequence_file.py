@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import hypot
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +14,28 @@ from acino_fte.species_file import read_yaml, validation_message
 
 FORMAT = "acino-fte/sequence/1"
 FILE_NAME = "sequence.yaml"
+
+
+class Ground(BaseModel):
+    """The plane that the animal stands on, in the world frame."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    normal: tuple[float, float, float] = Field((0.0, 0.0, 1.0), description="upwards, of any length")
+    height: float = Field(0.0, description="of the plane along its normal, from the origin, m")
+
+    @field_validator("normal")
+    @classmethod
+    def _has_a_direction(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not 1e-9 < hypot(*value) < 1e9:
+            raise ValueError(f"the normal {list(value)} has no direction; [0, 0, 1] is level ground")
+        return value
+
+    @property
+    def plane(self) -> tuple[float, float, float, float]:
+        """a, b, c, d with a x + b y + c z = d (m) and a unit normal (a, b, c)."""
+        a, b, c = (float(v / hypot(*self.normal)) for v in self.normal)
+        return a, b, c, self.height
 
 
 class SequenceFile(BaseModel):
@@ -31,6 +54,7 @@ class SequenceFile(BaseModel):
     )
     frames: tuple[int, int] | None = Field(None, description="start and stop, half-open, counted from 0")
     truth: str | None = Field(None, description="CSV with frame, marker, x, y, z (m) where they are known")
+    ground: Ground | None = Field(None, description="the plane that the animal stands on")
 
     @field_validator("keypoints", mode="before")
     @classmethod

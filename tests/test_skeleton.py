@@ -7,12 +7,13 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from acino_fte import models
 from acino_fte.errors import InputError
-from acino_fte.skeleton import DEFAULT_NOISE, Skeleton, expand, load_skeleton
+from acino_fte.skeleton import DEFAULT_NOISE, Skeleton, deformed, expand, load_skeleton
 from acino_fte.species_file import FORMAT, SpeciesFile, json_schema, read_species_file
 
 SMALL: dict[str, Any] = {
@@ -184,6 +185,70 @@ def test_the_content_hash_follows_the_geometry_only() -> None:
     assert build().content_hash != build(markers__nose__at=[0.41, 0, 0]).content_hash
 
 
+def standing(skeleton: Skeleton) -> np.ndarray:
+    """(M, 3) marker positions at zero, m: every frame is turned alike there."""
+    origins: list[np.ndarray] = []
+    for link in skeleton.links:
+        origins.append(np.array(link.at) + (origins[link.parent] if link.parent >= 0 else 0.0))
+    return np.array([origins[m.link] + np.array(m.at) for m in skeleton.markers])
+
+
+def group_of(skeleton: Skeleton) -> dict[str, str | None]:
+    """Segment group of each link."""
+    return {link.name: skeleton.groups[link.group] if link.group >= 0 else None for link in skeleton.links}
+
+
+def test_a_link_makes_a_group_of_its_own_and_its_twin_shares_it() -> None:
+    skeleton = build()
+    assert skeleton.groups == ("trunk", "l_leg", "l_foot")
+    sides = {"l_leg": "l_leg", "r_leg": "l_leg", "l_foot": "l_foot", "r_foot": "l_foot"}
+    assert group_of(skeleton) == {"trunk": "trunk", **sides}
+
+
+def test_a_declared_group_holds_twins_too() -> None:
+    for named in (["l_leg", "l_foot"], ["r_leg", "l_foot", "r_foot"]):
+        skeleton = build(groups={"limbs": named})
+        assert skeleton.groups == ("trunk", "limbs")
+        assert set(group_of(skeleton).values()) == {"trunk", "limbs"}
+    assert build(groups={"l_leg": ["l_leg", "l_foot"]}).groups == ("trunk", "l_leg")
+
+
+def test_a_link_that_nothing_is_attached_to_has_no_group() -> None:
+    skeleton = build(markers__l_toe__at=[0, 0, 0], markers__nose__at=[0, 0, 0], links__l_leg__at=[0, 0, 0])
+    assert skeleton.groups == ("l_leg",)
+    assert group_of(skeleton)["trunk"] is None
+    assert group_of(skeleton)["r_foot"] is None
+
+
+def test_another_individual_has_other_lengths() -> None:
+    skeleton = build(groups={"limbs": ["l_leg", "l_foot"]})
+    longer = deformed(skeleton, {"limbs": 1.2}, {"nose": [0.01, 0, -0.02]})
+    at = {link.name: link.at for link in longer.links}
+    assert at["l_leg"] == (0.1, 0.2, -0.3)  # on the trunk
+    assert at["l_foot"] == at["r_foot"] == pytest.approx((0, 0, -0.6))
+    assert longer.markers[longer.marker("r_toe")].at == pytest.approx((0.12, -0.012, 0))
+    assert longer.markers[longer.marker("nose")].at == pytest.approx((0.41, 0, -0.02))
+    assert longer.content_hash != skeleton.content_hash
+    assert deformed(skeleton, {"limbs": 1.0}) == skeleton
+    feet = [standing(s)[s.marker("l_toe")] for s in (skeleton, longer)]
+    np.testing.assert_allclose(feet, [[0.2, 0.21, -0.8], [0.22, 0.212, -0.9]], atol=1e-12)
+
+
+def test_another_individual_of_names_that_do_not_exist() -> None:
+    with pytest.raises(InputError, match="no segment group 'trunc'; did you mean 'trunk'"):
+        deformed(build(), {"trunc": 1.1})
+    with pytest.raises(InputError, match="no marker 'nosy'; did you mean 'nose'"):
+        deformed(build(), offsets={"nosy": [0, 0, 0]})
+
+
+def test_contacts_come_with_their_twins() -> None:
+    assert build().contacts == ()
+    for named in (["l_toe"], ["r_toe"], ["r_toe", "l_toe"]):
+        skeleton = build(contacts=named)
+        assert [skeleton.marker_names[i] for i in skeleton.contacts] == ["l_toe", "r_toe"]
+    assert build(contacts=["l_toe"]).content_hash == build().content_hash
+
+
 # --- what is said when a file contradicts itself ---
 
 FAULTS = [
@@ -198,6 +263,12 @@ FAULTS = [
     ({"draw": [["nose", "l_tow"]]}, r"draw[0]", "'l_tow' is no marker; did you mean 'l_toe'"),
     ({"draw": [["nose", "nose"]]}, r"draw[0]", "'nose' is paired with itself"),
     ({"body": [{"between": ["nos", "l_toe"], "radius": 1}]}, r"body[0].between", "'nos' is no marker"),
+    ({"groups": {"legs": ["l_legg"]}}, "groups.legs", "'l_legg' is no link; did you mean 'l_leg'"),
+    ({"groups": {"a": ["l_leg"], "b": ["l_leg"]}}, "groups.b", "'l_leg' is in the groups 'a' and 'b'"),
+    ({"groups": {"a": ["l_leg"], "b": ["r_leg"]}}, "groups.b", "'r_leg' is in the groups 'a' and 'b'"),
+    ({"groups": {"trunk": ["l_leg"]}}, "groups.trunk", "named like a link that is not in it"),
+    ({"groups": {"r_foot": ["l_leg"]}}, "groups.r_foot", "named like a link that is not in it"),
+    ({"contacts": ["l_toe", "l_tow"]}, "contacts", "'l_tow' is no marker; did you mean 'l_toe'"),
     ({"order": ["trunk.x"]}, "order", "must name every degree of freedom once"),
     ({"order": ["trunk.zaw"]}, "order", "names 'trunk.zaw'.*did you mean 'trunk.yaw'"),
     ({"order": ["trunk.x", "trunk.x"]}, "order", "names 'trunk.x' twice"),
@@ -245,6 +316,8 @@ SCHEMA_FAULTS = [
     ({"units": {"length": "inch"}}, "units.length", "'m', 'cm' or 'mm', found 'inch'"),
     ({"links": {}}, "links", "at least 1 item"),
     ({"draw": [["nose"]]}, "draw.0", "at least 2 items"),
+    ({"groups": {"legs": []}}, "groups.legs", "at least 1 item"),
+    ({"contact": ["nose"]}, "contact", "did you mean 'contacts'"),
 ]
 
 
@@ -336,3 +409,7 @@ def test_bundled_files_are_complete(name: str) -> None:
     assert all(dof.noise for link in file.links.values() for dof in link.dofs.values())
     assert (file.units.length, file.units.angle) == ("m", "deg")
     assert len(skeleton.twins) >= 9
+    assert len(skeleton.groups) < len(skeleton.links)
+    contacts = {skeleton.marker_names[i] for i in skeleton.contacts}
+    assert contacts and all(m.endswith(("paw", "heel", "toe")) for m in contacts)
+    assert skeleton.marker_names[int(np.argmin(standing(skeleton)[:, 2]))] in contacts
