@@ -15,16 +15,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
+from functools import cached_property
 
 import numpy as np
 
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.kinematics import Kinematics
 from acino_fte.skeleton import Dof, Skeleton
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
 
 ROOT_MOTIONS = ("forward", "left", "up", "yaw", "pitch", "roll")
 _MARGIN = 0.01  # of a range, kept free at both ends
@@ -112,6 +109,94 @@ class Recipe:
         return [p for p in self.needs if not any(fnmatchcase(n, p) for n in skeleton.dof_names)]
 
 
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion put on an animal: its degrees of freedom as a continuous function of time.
+
+    The frames of the recording decide how the waves are fitted to the ranges of the joints, where the middle
+    of the path is, and how high the root. At any other time it is the same movement, not a new one.
+
+    Attributes
+    ----------
+    kinematics : Kinematics
+    recipe : Recipe
+    time : (N,)
+        Of the frames, s.
+    speed : float
+        Over the ground, m/s.
+    parameters : (K,), optional
+        Of the kinematics: the proportions of the animal.
+    """
+
+    kinematics: Kinematics
+    recipe: Recipe
+    time: np.ndarray
+    speed: float
+    parameters: np.ndarray | None = None
+
+    @cached_property
+    def at_frames(self) -> np.ndarray:
+        """(N, Q) degrees of freedom at the frames, rad and m, within the ranges of the species."""
+        return self._lifted(self._pose(self._raw_frames, len(self.time)), self.time)
+
+    def __call__(self, time: np.ndarray) -> np.ndarray:
+        """(T, Q) degrees of freedom at times (T,), s; rad and m."""
+        raw = self._raw(time)
+        for j in _root_turns(self.kinematics.skeleton).values():  # on the branch that the frames are on
+            near = np.interp(time, self.time, self._raw_frames[j])
+            raw[j] += 2 * np.pi * np.round((near - raw[j]) / (2 * np.pi))
+        return self._lifted(self._pose(raw, len(time)), time)
+
+    @cached_property
+    def _raw_frames(self) -> dict[int, np.ndarray]:
+        return self._raw(self.time)
+
+    def _raw(self, time: np.ndarray) -> dict[int, np.ndarray]:
+        """Values (T,) of the degrees of freedom that move, by index, whatever their ranges; rad and m."""
+        stride, values = self.recipe.rate * time, {}
+        for j, dof in enumerate(self.kinematics.skeleton.dofs):
+            wave = self.recipe.wave(dof.name)
+            if wave is not None:
+                values[j] = np.radians(wave(stride)) if dof.kind == "turn" else wave(stride)
+        along = self.speed * (time - 0.5 * (self.time[0] + self.time[-1]))
+        return values | root_values(self.kinematics.skeleton, self.recipe, stride, along)
+
+    def _pose(self, raw: dict[int, np.ndarray], n_times: int) -> np.ndarray:
+        """(T, Q): values put into their ranges as at the frames; what does not move is at rest."""
+        dofs = self.kinematics.skeleton.dofs
+        q = np.empty((n_times, len(dofs)))
+        for j, dof in enumerate(dofs):
+            q[:, j] = fit_to_range(raw[j], dof, self._raw_frames[j]) if j in raw else resting_value(dof)
+        return q
+
+    def _lifted(self, q: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """The root of q (T, Q) raised so that the lowest marker follows the ground, if the recipe says so."""
+        skeleton = self.kinematics.skeleton
+        upright = [j for j in root_dofs(skeleton, "slide") if skeleton.dofs[j].axis[2] != 0]
+        if self.recipe.grounded and upright:
+            dof = skeleton.dofs[upright[0]]
+            weight, spare = self._ground
+            smooth = self._ground_basis(time) @ weight
+            lift = (_CLEARANCE - smooth - min(0.0, spare)) * np.sign(dof.axis[2])
+            q[:, upright[0]] = np.clip(q[:, upright[0]] + lift, dof.lower, dof.upper)
+        return q
+
+    @cached_property
+    def _ground(self) -> tuple[np.ndarray, float]:
+        """Height of the lowest marker as a smooth function of the stride, and its deepest dip below that."""
+        q = self._pose(self._raw_frames, len(self.time))
+        lowest = self.kinematics.positions(q, self.parameters)[:, :, 2].min(axis=1)
+        basis = self._ground_basis(self.time)
+        weight = np.linalg.lstsq(basis, lowest, rcond=None)[0]
+        return weight, float(np.min(lowest - basis @ weight))
+
+    def _ground_basis(self, time: np.ndarray) -> np.ndarray:
+        turn = 2 * np.pi * self.recipe.rate * time[:, None]
+        basis = np.concatenate([np.ones_like(turn), np.cos(2 * turn), np.sin(2 * turn)], axis=1)
+        enough = len(self.time) >= 2 * basis.shape[1] and self.recipe.rate
+        return basis if enough else basis[:, :1]
+
+
 def motion_names(skeleton: Skeleton | None = None) -> list[str]:
     """Names of the motions; with a species, of those that fit it."""
     from acino_fte.motion_recipes import RECIPES
@@ -156,20 +241,25 @@ def make_motion(
     InputError
         There is no such motion, or it does not fit the species.
     """
-    skeleton = kinematics.skeleton
-    recipe = motion if isinstance(motion, Recipe) else find_recipe(skeleton, motion, seed)
-    _check_fit(recipe, skeleton)
-    time = np.arange(n_frames) / fps
-    q = np.zeros((n_frames, len(skeleton.dofs)))
-    for j, dof in enumerate(skeleton.dofs):
-        wave = recipe.wave(dof.name)
-        q[:, j] = resting_value(dof) if wave is None else _fitted(wave, recipe.rate * time, dof)
+    return plan_motion(kinematics, motion, n_frames, fps, seed=seed, longest_path=longest_path).at_frames
+
+
+def plan_motion(
+    kinematics: Kinematics,
+    motion: str | Recipe,
+    n_frames: int,
+    fps: float,
+    *,
+    seed: int = 0,
+    longest_path: float = math.inf,
+    parameters: np.ndarray | None = None,
+) -> Motion:
+    """The motion of :func:`make_motion` as a function of time, of an animal with parameters (K,)."""
+    recipe = motion if isinstance(motion, Recipe) else find_recipe(kinematics.skeleton, motion, seed)
+    _check_fit(recipe, kinematics.skeleton)
     travel = recipe.speed * n_frames / fps
     speed = recipe.speed * min(1.0, longest_path / travel) if travel > 0 else 0.0
-    place_root(skeleton, recipe, time, speed, q)
-    if recipe.grounded:
-        _put_on_ground(kinematics, recipe, time, q)
-    return q
+    return Motion(kinematics, recipe, np.arange(n_frames) / fps, speed, parameters)
 
 
 def find_recipe(skeleton: Skeleton, motion: str, seed: int) -> Recipe:
@@ -207,19 +297,17 @@ def resting_value(dof: Dof) -> float:
     return 0.0 if dof.lower < 0 < dof.upper else dof.middle
 
 
-def _fitted(wave: Wave, stride: np.ndarray, dof: Dof) -> np.ndarray:
-    """Values of a wave (N,), moved and shrunk about their middle until they fit the range."""
-    value = wave(stride)
-    return fit_to_range(np.radians(value) if dof.kind == "turn" else value, dof)
+def fit_to_range(value: np.ndarray, dof: Dof, like: np.ndarray | None = None) -> np.ndarray:
+    """Values (N,) shrunk and moved, not clipped, so that they lie in the range with a small margin.
 
-
-def fit_to_range(value: np.ndarray, dof: Dof) -> np.ndarray:
-    """Values (N,) shrunk and moved, not clipped, so that they lie in the range with a small margin."""
-    if not math.isfinite(dof.upper - dof.lower) or not value.size:
+    With ``like`` (T,) they are shrunk and moved as those would have to be.
+    """
+    like = value if like is None else like
+    if not math.isfinite(dof.upper - dof.lower) or not like.size:
         return np.clip(value, dof.lower, dof.upper)
     margin = _MARGIN * (dof.upper - dof.lower)
     lower, upper = dof.lower + margin, dof.upper - margin
-    low, high = float(value.min()), float(value.max())
+    low, high = float(like.min()), float(like.max())
     middle, scale = 0.5 * (low + high), 1.0
     if high - low > upper - lower:
         scale = (upper - lower) / (high - low)
@@ -227,57 +315,43 @@ def fit_to_range(value: np.ndarray, dof: Dof) -> np.ndarray:
     return np.clip(middle, lower + half, upper - half) + scale * (value - middle)
 
 
-def place_root(skeleton: Skeleton, recipe: Recipe, time: np.ndarray, speed: float, q: np.ndarray) -> None:
-    """Write the position and orientation of the root, which travels along the path, into q (N, Q)."""
+def root_dofs(skeleton: Skeleton, kind: str) -> list[int]:
+    """Indices of the slides or turns of the root."""
+    dofs = [j for link in skeleton.links if link.parent < 0 for j in link.dofs]
+    return [j for j in dofs if skeleton.dofs[j].kind == kind]
+
+
+def _root_turns(skeleton: Skeleton) -> dict[str, int]:
+    """Index of the root's turn about each axis, in the order of rotation."""
+    dofs = skeleton.dofs
+    return {"xyz"[int(np.argmax(np.abs(dofs[j].axis)))]: j for j in root_dofs(skeleton, "turn")}
+
+
+def root_values(
+    skeleton: Skeleton, recipe: Recipe, stride: np.ndarray, along: np.ndarray
+) -> dict[int, np.ndarray]:
+    """Position and orientation of the root, in the degrees of freedom that it has.
+
+    ``stride`` (T,) is the time in strides, ``along`` (T,) the way from the middle of the path, m. Returns the
+    values (T,), m and rad, by the index of the degree of freedom.
+    """
     from scipy.spatial.transform import Rotation
 
-    wave = {key: recipe.root.get(key, Wave())(recipe.rate * time) for key in ROOT_MOTIONS}
-    along = speed * (time - 0.5 * (time[0] + time[-1]))
+    wave = {key: recipe.root.get(key, Wave())(stride) for key in ROOT_MOTIONS}
     heading = recipe.curvature * along
     if recipe.curvature:
         path = np.stack([np.sin(heading), 1 - np.cos(heading), 0 * heading], axis=1) / recipe.curvature
     else:
         path = np.stack([along, 0 * along, 0 * along], axis=1)
-    lean = np.full(len(time), -math.radians(recipe.lean) * np.sign(recipe.curvature))
+    lean = np.full(len(along), -math.radians(recipe.lean) * np.sign(recipe.curvature))
     frame = Rotation.from_euler("ZX", np.stack([heading, lean], axis=1))
     offset = np.stack([wave["forward"], wave["left"], wave["up"]], axis=1)
     body = np.radians(np.stack([wave["yaw"], wave["pitch"], wave["roll"]], axis=1))
-    _write_root(skeleton, path + frame.apply(offset), frame * Rotation.from_euler("ZYX", body), q)
-
-
-def _write_root(skeleton: Skeleton, position: np.ndarray, rotation: Rotation, q: np.ndarray) -> None:
-    """Express a position (N, 3) and a rotation in the degrees of freedom that the root has."""
-    dofs = [(j, skeleton.dofs[j]) for link in skeleton.links if link.parent < 0 for j in link.dofs]
-    for j, dof in dofs:
-        if dof.kind == "slide":
-            q[:, j] = fit_to_range(position @ np.array(dof.axis), dof)
-    turns = {("xyz"[int(np.argmax(np.abs(d.axis)))]): j for j, d in dofs if d.kind == "turn"}
+    position, rotation = path + frame.apply(offset), frame * Rotation.from_euler("ZYX", body)
+    dofs, turns = skeleton.dofs, _root_turns(skeleton)
     order = "".join(turns) if len(turns) == 3 else "zyx"
     angles = np.unwrap(rotation.as_euler(order.upper()), axis=0)
-    for axis, j in turns.items():
-        value = angles[:, order.index(axis)] * np.sign(np.sum(skeleton.dofs[j].axis))
-        q[:, j] = fit_to_range(value, skeleton.dofs[j])
-
-
-def _put_on_ground(kinematics: Kinematics, recipe: Recipe, time: np.ndarray, q: np.ndarray) -> None:
-    """Raise the root by a smooth function of the stride so that the lowest marker follows the ground."""
-    skeleton = kinematics.skeleton
-    slides = [
-        j
-        for link in skeleton.links
-        if link.parent < 0
-        for j in link.dofs
-        if skeleton.dofs[j].kind == "slide" and skeleton.dofs[j].axis[2] != 0
-    ]
-    if not slides:
-        return
-    lowest = kinematics.positions(q)[:, :, 2].min(axis=1)
-    turn = 2 * np.pi * recipe.rate * time[:, None]
-    basis = np.concatenate([np.ones_like(turn), np.cos(2 * turn), np.sin(2 * turn)], axis=1)
-    if len(time) < 2 * basis.shape[1] or not recipe.rate:
-        basis = basis[:, :1]
-    smooth = basis @ np.linalg.lstsq(basis, lowest, rcond=None)[0]
-    spare = float(np.min(lowest - smooth))
-    j = slides[0]
-    lift = (_CLEARANCE - smooth - min(0.0, spare)) * np.sign(skeleton.dofs[j].axis[2])
-    q[:, j] = np.clip(q[:, j] + lift, skeleton.dofs[j].lower, skeleton.dofs[j].upper)
+    values = {j: position @ np.array(dofs[j].axis) for j in root_dofs(skeleton, "slide")}
+    return values | {
+        j: angles[:, order.index(axis)] * np.sign(np.sum(dofs[j].axis)) for axis, j in turns.items()
+    }
