@@ -1,7 +1,7 @@
 """The condensed lowering: value, gradient and sparse Hessian of the objective over q and θ alone.
 
-With Σ ρ(r_k/σ_k) and r_k a function of marker positions p(q, θ), of q at a few frames and of θ, the chain rule
-gives
+With Σ ρ(r_k/σ_k) and r_k a function of marker positions p(q, θ), of q at a few frames and of θ, the chain
+rule gives
 
     gradient  = Σ_k ψ_k/σ_k · ∂r_k,
     Hessian   ≈ Σ_k ω_k/σ_k² · ∂r_kᵀ∂r_k   (Gauss–Newton with IRLS weights ω = ψ/e: positive semidefinite),
@@ -19,6 +19,7 @@ x = (q.ravel(), θ/σ_θ): parameters in units of their priors' standard deviati
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
@@ -86,6 +87,10 @@ class Condensed:
         for term, found in zip(self.compiled, self._found, strict=True):
             values[term.term.family] = values.get(term.term.family, 0.0) + float(found.losses[0].sum())
         return values
+
+    def evaluated(self) -> Iterator[tuple[CompiledTerm, Evaluation]]:
+        """The terms, as they were evaluated last."""
+        return zip(self.compiled, self._found, strict=True)
 
     # --- derivatives -------------------------------------------------------------------------------
 

@@ -72,6 +72,9 @@ class PriorWidths:
         Of a camera's turn (rad, per axis) and shift (m, per axis).
     offset : float
         Of a marker's displacement, m per axis.
+    size : float
+        Of the relative size of the whole set of cameras, when both scales and cameras are estimated:
+        pictures cannot tell a larger animal before wider cameras from a smaller one before nearer ones.
     """
 
     scale: float = 0.1
@@ -79,6 +82,7 @@ class PriorWidths:
     rotation: float = float(np.radians(0.5))
     translation: float = 0.1
     offset: float = 0.03
+    size: float = 0.005
 
 
 _REACH = 5.0  # bounds, in prior standard deviations

@@ -1,12 +1,11 @@
 """The full trajectory estimation problem, stated but not solved.
 
-Minimise over q (N, Q), within its bounds,
-the negative log-posterior
+Minimise over q (N, Q) and the global parameters θ (:mod:`acino_fte.parameters`), within their bounds, the
+negative log-posterior
 
     Σ_frames,cameras,markers ρ(|π(p(q, θ)) − z|/σ_px)  +  ½ Σ (w/σ_w)²  +  ½ Σ ((q − mean)/σ_prior)²
-        +  ½ Σ (θ/σ_θ)²
+        +  ½ Σ (θ/σ_θ)²,
 
-and over the global parameters θ (:mod:`acino_fte.parameters`), within theirs,
 with w the jump of acceleration from frame to frame (Joska et al. 2021, eq. 4–9, with the ½ of a Gaussian
 likelihood, so that the curvature at the optimum is an information matrix).
 """
@@ -25,7 +24,8 @@ from acino_fte.kinematics import Kinematics
 from acino_fte.losses import Loss
 from acino_fte.parameters import KINEMATIC, Parameters, PriorWidths, check_families, declare
 from acino_fte.sequence import Sequence
-from acino_fte.terms import Term, measurement_term, model_term, parameter_term, prior_term
+from acino_fte.skeleton import Skeleton
+from acino_fte.terms import Term, measurement_term, model_term, parameter_term, prior_term, size_terms
 
 _NONE = Parameters()
 
@@ -74,8 +74,27 @@ class FTEOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class Assumptions:
+    """What the data may overrule; each None keeps what species and sequence say.
+
+    Attributes
+    ----------
+    pixels : (N, C, M, 2), optional
+        Detections that count, px, NaN where none.
+    sd_px : (M,), optional
+        Standard deviation of every marker's detections, px.
+    noise_factors : (Q,), optional
+        Factor on the process noise of every degree of freedom.
+    """
+
+    pixels: np.ndarray | None = None
+    sd_px: np.ndarray | None = None
+    noise_factors: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class FTEProblem:
-    """A trajectory problem: terms over q (N, Q) and θ (P,), and bounds. Made by :func:`build_fte`, solved elsewhere.
+    """A trajectory problem: terms over q (N, Q) and θ (P,), and bounds. :func:`build_fte` makes one.
 
     Attributes
     ----------
@@ -140,12 +159,14 @@ def build_problem(
     terms: list[Term],
     options: FTEOptions,
     parameters: Parameters = _NONE,
+    noise_factors: np.ndarray | float = 1.0,
 ) -> FTEProblem:
     """Add motion model, priors and bounds to terms that hold the data."""
     skeleton, n = kinematics.skeleton, len(frames)
     if n > 3:
         model = model_term(skeleton, n, fps)
-        terms = [*terms, replace(model, sd=model.sd * options.noise_scale)]
+        factors = np.broadcast_to(noise_factors, len(skeleton.dofs))[model.items[:, 0]]
+        terms = [*terms, replace(model, sd=model.sd * options.noise_scale * factors)]
     if options.prior_width > 0:
         terms = [*terms, prior_term(skeleton, n, options.prior_width)]
     if len(parameters):
@@ -158,7 +179,12 @@ def build_problem(
     )
 
 
-def build_fte(sequence: Sequence, kinematics: Kinematics, options: FTEOptions | None = None) -> FTEProblem:
+def build_fte(
+    sequence: Sequence,
+    kinematics: Kinematics,
+    options: FTEOptions | None = None,
+    assumptions: Assumptions | None = None,
+) -> FTEProblem:
     """State the trajectory problem of a sequence. Pure: solves nothing, reads and writes nothing.
 
     Raises
@@ -166,10 +192,13 @@ def build_fte(sequence: Sequence, kinematics: Kinematics, options: FTEOptions | 
     InputError
         No detection is above the likelihood threshold.
     """
-    options = options or FTEOptions()
+    options, assumed = options or FTEOptions(), assumptions or Assumptions()
     skeleton = kinematics.skeleton
-    pixels = sequence.pixels(skeleton.marker_names, options.likelihood)
-    sd = np.array([m.sd_px for m in skeleton.markers])
+    pixels, sd = assumed.pixels, assumed.sd_px
+    if pixels is None:
+        pixels = sequence.pixels(skeleton.marker_names, options.likelihood)
+    if sd is None:
+        sd = np.array([m.sd_px for m in skeleton.markers])
     parameters = _parameters(sequence, skeleton, options)
     terms = [
         measurement_term(camera, pixels[:, c], sd, options.loss, sequence.n_frames, parameters)
@@ -182,7 +211,10 @@ def build_fte(sequence: Sequence, kinematics: Kinematics, options: FTEOptions | 
             key="likelihood",
             remedy="lower --likelihood, or choose frames in which the animal is seen",
         )
-    problem = build_problem(kinematics, sequence.fps, sequence.frames, present, options, parameters)
+    if {"scale", "extrinsics"} <= set(parameters.families):
+        present += size_terms(parameters, sequence.cameras, options.widths.size)
+    factors = 1.0 if assumed.noise_factors is None else assumed.noise_factors
+    problem = build_problem(kinematics, sequence.fps, sequence.frames, present, options, parameters, factors)
     return replace(problem, sequence=sequence)
 
 

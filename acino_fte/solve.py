@@ -111,7 +111,8 @@ class SolveOptions:
 class Minimum:
     """Where a solve ended: status, q (N, Q), objective, iterations, θ (P,), multipliers of the bounds.
 
-    ``multipliers`` (N, Q) is what the bounds on q hold back: positive where a joint is at its limit.
+    ``multipliers`` (N·Q + P,) is what the bounds hold back, for the solver's variables
+    (:mod:`acino_fte.condensed`): positive where a joint or a parameter is at its limit.
     """
 
     status: Status
@@ -200,7 +201,7 @@ def minimise(
     if not status.ok and callbacks.best[0] < np.inf:
         value, x = callbacks.best
     q, found = condensed.unpack(np.clip(x, lower, upper))
-    multipliers = (info["mult_x_L"] + info["mult_x_U"])[: q.size].reshape(q.shape)
+    multipliers = info["mult_x_L"] + info["mult_x_U"]
     return Minimum(status, q, value, callbacks.iterations, found, multipliers)
 
 

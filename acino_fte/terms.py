@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acino_fte import projection
-from acino_fte.cameras import Camera
+from acino_fte.cameras import Camera, CameraArray
 from acino_fte.losses import Loss
 from acino_fte.parameters import POSE, Parameters
 from acino_fte.residuals import AXES, Derived, Handle, Let, Residual
@@ -206,6 +206,41 @@ def parameter_term(parameters: Parameters) -> Term:
     return Term(
         "parameter", WIDTH, np.zeros(n, dtype=int), np.arange(n)[:, None], {"mean": 0.0}, parameters.sd
     )
+
+
+@cache
+def _size_residual(count: int) -> Residual:
+    """Relative change in size of the set of cameras, Σ a_i·d_i over the shifts d of its cameras."""
+
+    def derive(handles: list[Any], data: dict[str, sp.Symbol], _let: Let) -> Derived:
+        return [sum(data[f"a{i}"] * handle for i, handle in enumerate(handles))], []
+
+    handles = tuple(Handle("parameter", item=i) for i in range(count))
+    data = tuple(f"a{i}" for i in range(count))
+    return Residual(f"size-{count}", handles, data, ("size",), "1", derive, _HERE)
+
+
+def size_terms(parameters: Parameters, cameras: CameraArray, sd: float) -> list[Term]:
+    """Hold the size of the set of cameras, the one direction of a similarity that no image shows.
+
+    A shift d in a camera's frame moves its centre c by −Rᵀd, to first order, and the set grows by
+    Σ (c − c̄)·(−Rᵀd) / Σ |c − c̄|². Moving cameras count with their first pose.
+    """
+    poses = [(np.reshape(c.rotation, (-1, 3, 3))[0], np.reshape(c.centre, (-1, 3))[0]) for c in cameras]
+    centres = np.array([centre for _, centre in poses])
+    spread = centres - centres.mean(axis=0)
+    total = float((spread**2).sum())
+    places, weights = [], []
+    for camera, (rotation, _), arm in zip(cameras, poses, spread, strict=True):
+        place = parameters.place("extrinsics", camera.name, "tx")
+        if place is not None and total > 0:
+            places += [place, place + 1, place + 2]
+            weights += (-(rotation @ arm) / total).tolist()
+    if not places:
+        return []
+    data = {f"a{i}": w for i, w in enumerate(weights)}
+    frame, items = np.zeros(1, dtype=int), np.array([places])
+    return [Term("size", _size_residual(len(places)), frame, items, data, np.array([sd]))]
 
 
 def point_term(points: np.ndarray, sd: float | np.ndarray, loss: Loss) -> Term:
