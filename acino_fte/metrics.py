@@ -5,6 +5,7 @@ Every definition, with its source, is in ``docs/metrics.md``. Shapes: N frames, 
 A detection whose marker ends up behind the camera that saw it has no reprojection. It counts as infinitely
 far away wherever that has a meaning (median, p90, share within 20 px, share of outliers); the moments
 (mean, RMSE, standard deviation) are those of the rest, and ``n_behind_camera`` says how many there are.
+A marker that a method gave no position has no error at all; it counts against ``coverage``.
 """
 
 from __future__ import annotations
@@ -16,13 +17,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acino_fte.metrics_parameters import parameter_errors
+from acino_fte.metrics_truth import quantile, truth_metrics, uncertainty_metrics
+
 if TYPE_CHECKING:
     from acino_fte.result import FTEResult
+    from acino_fte.skeleton import Dof
 
 OUTLIER_SD = 20.0
 """An observation is an outlier when its error is beyond this many standard deviations of its marker."""
 NEAR_PX = 20.0
 """Radius of ``within_20px``."""
+NOSE_EYE_SHARE = 0.5
+"""Radius of ``pck_nose_eye`` as a share of the distance from the nose to the eyes in the image."""
 LIMIT_TOLERANCE = {"turn": math.radians(0.1), "slide": 1e-3}
 """How near to its limit a degree of freedom is *at* its limit, rad or m."""
 _OUTSIDE = 1e-6  # rad, m: beyond the slack that interior-point solvers give a bound
@@ -39,7 +46,8 @@ def result_metrics(result: FTEResult) -> dict[str, Any]:
     Returns
     -------
     dict
-        As described in ``docs/metrics.md``. ``truth_mm`` is there only when the sequence carries truth.
+        As described in ``docs/metrics.md``. ``truth_mm`` and ``parameter_errors`` are there only when the
+        sequence carries truth, ``uncertainty`` only when the result carries covariance.
     """
     from acino_fte import __version__
 
@@ -71,9 +79,12 @@ def result_metrics(result: FTEResult) -> dict[str, Any]:
         "options": result.options,
         "warnings": list(sequence.warnings),
     }
-    truth = truth_metrics(result)
-    if truth is not None:
-        metrics["truth_mm"] = truth
+    optional = {
+        "truth_mm": truth_metrics(result),
+        "uncertainty": uncertainty_metrics(result),
+        "parameter_errors": parameter_errors(result) or None,
+    }
+    metrics |= {name: value for name, value in optional.items() if value is not None}
     return json_safe(metrics)
 
 
@@ -91,9 +102,45 @@ def realtime_factor(duration: float, seconds: Mapping[str, float]) -> float | No
 
 
 def point_errors(result: FTEResult) -> np.ndarray:
-    """(N, C, M) reprojection error, px; NaN where nothing was observed, ∞ where the marker is behind."""
-    seen = np.isfinite(result.observed).all(-1)
+    """(N, C, M) reprojection error, px; ∞ where the marker is behind the camera.
+
+    NaN where nothing was observed, or where the method has no position to compare with.
+    """
+    seen = np.isfinite(result.observed).all(-1) & np.isfinite(result.positions).all(-1)[:, None]
     return np.where(seen, np.where(np.isfinite(result.errors), result.errors, np.inf), np.nan)
+
+
+def coverage(result: FTEResult) -> float | None:
+    """Share of the markers observed in a frame, by any camera, that have a position; None without any."""
+    observed = np.isfinite(result.observed).all(-1).any(axis=1)
+    found = np.isfinite(result.positions).all(-1)
+    return float(found[observed].mean()) if observed.any() else None
+
+
+def nose_eye_share(result: FTEResult) -> dict[str, Any]:
+    """``pck_nose_eye``: share of the observations nearer than half the nose–eye distance in that image.
+
+    The distance is that between the reprojections of ``nose`` and of the mean of ``l_eye`` and ``r_eye``
+    (or of the one there is), px. Observations in images without it do not count.
+
+    Returns
+    -------
+    dict
+        ``{"pck_nose_eye": share}``, None without an observation; empty when the species lacks the markers.
+    """
+    names = result.skeleton.marker_names
+    eyes = [names.index(eye) for eye in ("l_eye", "r_eye") if eye in names]
+    if "nose" not in names or not eyes:
+        return {}
+    pixels = result.reprojected[:, :, eyes]
+    there = np.isfinite(pixels).all(-1, keepdims=True)
+    count = there.sum(axis=2)
+    eye = np.where(there, pixels, 0.0).sum(axis=2) / np.where(count > 0, count, np.nan)
+    yardstick = np.linalg.norm(eye - result.reprojected[:, :, names.index("nose")], axis=-1)
+    errors = point_errors(result)
+    counted = ~np.isnan(errors) & np.isfinite(yardstick)[..., None]
+    correct = (errors < NOSE_EYE_SHARE * yardstick[..., None])[counted]
+    return {"pck_nose_eye": float(correct.mean()) if correct.size else None}
 
 
 def reprojection_metrics(result: FTEResult) -> dict[str, Any]:
@@ -102,8 +149,8 @@ def reprojection_metrics(result: FTEResult) -> dict[str, Any]:
     Returns
     -------
     dict
-        median, mean, rmse, std, p90 (px), outlier_ratio, within_20px (shares), n_behind_camera, and
-        ``per_camera``, ``per_marker``: name → {median, mean, p90, within_20px, n}.
+        median, mean, rmse, std, p90 (px), outlier_ratio, within_20px, pck_nose_eye, coverage (shares),
+        n_behind_camera, and ``per_camera``, ``per_marker``: name → {median, mean, p90, within_20px, n}.
     """
     errors = point_errors(result)
     sd = np.array([marker.sd_px for marker in result.skeleton.markers])
@@ -120,6 +167,8 @@ def reprojection_metrics(result: FTEResult) -> dict[str, Any]:
         "outlier_ratio": float(np.mean(scaled > OUTLIER_SD)) if scaled.size else None,
         "outlier_beyond_sd": OUTLIER_SD,
         "within_20px": short["within_20px"],
+        **nose_eye_share(result),
+        "coverage": coverage(result),
         "n_behind_camera": int(np.isinf(everything).sum()),
         "per_camera": {
             camera.name: summarise(errors[:, c]) for c, camera in enumerate(result.sequence.cameras)
@@ -135,24 +184,12 @@ def summarise(errors: np.ndarray) -> dict[str, Any]:
     errors = errors[~np.isnan(errors)]
     finite = errors[np.isfinite(errors)]
     return {
-        "median": _quantile(errors, 0.5),
+        "median": quantile(errors, 0.5),
         "mean": float(finite.mean()) if finite.size else None,
-        "p90": _quantile(errors, 0.9),
+        "p90": quantile(errors, 0.9),
         "within_20px": float(np.mean(errors <= NEAR_PX)) if errors.size else None,
         "n": int(errors.size),
     }
-
-
-def _quantile(values: np.ndarray, share: float) -> float | None:
-    """Quantile by linear interpolation (Hyndman and Fan 1996, type 7); None when empty or infinite."""
-    if not values.size:
-        return None
-    ordered = np.sort(values)
-    place = share * (len(ordered) - 1)
-    low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
-    if not math.isfinite(high):
-        return float(low) if place == math.floor(place) and math.isfinite(low) else None
-    return float(low + (place - math.floor(place)) * (high - low))
 
 
 def speed_metrics(result: FTEResult) -> dict[str, Any]:
@@ -162,12 +199,31 @@ def speed_metrics(result: FTEResult) -> dict[str, Any]:
     """
     if len(result.positions) < 2:
         return {"body": None, "per_marker": dict.fromkeys(result.skeleton.marker_names)}
-    body = speeds(result.positions.mean(axis=1), result.sequence.fps)
-    markers = np.median(speeds(result.positions, result.sequence.fps), axis=0)
+    fps = result.sequence.fps
+    markers = speeds(result.positions, fps).T
     return {
-        "body": float(np.median(body)),
-        "per_marker": dict(zip(result.skeleton.marker_names, map(float, markers), strict=True)),
+        "body": _median(body_speed(result.positions, fps)),
+        "per_marker": dict(zip(result.skeleton.marker_names, map(_median, markers), strict=True)),
     }
+
+
+def _median(values: np.ndarray) -> float | None:
+    """Median of the values that are numbers; None without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else None
+
+
+def body_speed(positions: np.ndarray, fps: float) -> np.ndarray:
+    """(N,) speed of the mean of all markers, m/s, of positions (N, M, 3), m; N ≥ 2.
+
+    Where markers are missing, the mean velocity of those that are there; NaN where there are none.
+    (A mean of positions would jump whenever a marker comes or goes.)
+    """
+    velocity = np.gradient(positions, 1.0 / fps, axis=0)
+    there = np.isfinite(velocity).all(-1)
+    count = np.where(there.any(axis=1), there.sum(axis=1), np.nan)
+    total = np.where(there[..., None], velocity, 0.0).sum(axis=1)
+    return np.linalg.norm(total / count[:, None], axis=-1)
 
 
 def speeds(positions: np.ndarray, fps: float) -> np.ndarray:
@@ -175,10 +231,17 @@ def speeds(positions: np.ndarray, fps: float) -> np.ndarray:
     return np.linalg.norm(np.gradient(positions, 1.0 / fps, axis=0), axis=-1)
 
 
+def _dof_values(result: FTEResult) -> list[tuple[Dof, np.ndarray]]:
+    """Degrees of freedom with their values over time (N,); none of a method without a skeleton."""
+    if not result.q.shape[1]:
+        return []
+    return list(zip(result.skeleton.dofs, result.q.T, strict=True))
+
+
 def joints_at_limit(result: FTEResult) -> dict[str, float]:
     """Share of the frames in which a degree of freedom is at its limit, for those that ever are."""
     shares = {}
-    for dof, values in zip(result.skeleton.dofs, result.q.T, strict=True):
+    for dof, values in _dof_values(result):
         near = LIMIT_TOLERANCE[dof.kind]
         share = float(np.mean((values <= dof.lower + near) | (values >= dof.upper - near)))
         if share > 0:
@@ -190,31 +253,9 @@ def joints_outside_limits(result: FTEResult) -> list[str]:
     """Names of the degrees of freedom that leave their range by more than 1e-6 rad or m."""
     return [
         dof.name
-        for dof, values in zip(result.skeleton.dofs, result.q.T, strict=True)
+        for dof, values in _dof_values(result)
         if np.any((values < dof.lower - _OUTSIDE) | (values > dof.upper + _OUTSIDE))
     ]
-
-
-def truth_errors(result: FTEResult) -> np.ndarray | None:
-    """(N, M) distance to the true positions, m; NaN where there is no truth; None without any."""
-    if result.sequence.truth is None:
-        return None
-    truth = result.sequence.truth.reindex(marker=result.skeleton.marker_names)
-    true = truth.transpose("frame", "marker", "space").values
-    return np.linalg.norm(result.positions - true, axis=-1)
-
-
-def truth_metrics(result: FTEResult) -> dict[str, Any] | None:
-    """mpjpe (mean per-joint position error), median and p95 against truth, mm; None without truth."""
-    errors = truth_errors(result)
-    if errors is None:
-        return None
-    millimetres = 1000.0 * errors[np.isfinite(errors)]
-    return {
-        "mpjpe": float(millimetres.mean()) if millimetres.size else None,
-        "median": _quantile(millimetres, 0.5),
-        "p95": _quantile(millimetres, 0.95),
-    }
 
 
 def json_safe(value: Any) -> Any:

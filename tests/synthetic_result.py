@@ -1,5 +1,7 @@
 """A small FTEResult without a solver: a cheetah gallops past a row of cameras."""
 
+from dataclasses import replace
+
 import numpy as np
 import xarray as xr
 
@@ -109,4 +111,51 @@ def make_result(
         method="fte-condensed",
         seconds={"load": 0.5, "initialise": 0.02, "build": 0.01, "solve": 0.07},
         options={"likelihood": 0.5, "loss": "redescending", "solve": {"max_iter": 200}},
+    )
+
+
+def with_estimates(result, seed=1):
+    """The result as an estimator with parameters and uncertainty leaves it; errors are as claimed."""
+    rng = np.random.default_rng(seed)
+    n, m = result.positions.shape[:2]
+    names = result.sequence.cameras.names
+    views = np.isfinite(result.observed).all(-1).sum(axis=1)
+    factor = rng.normal(0, 1, (n, m, 3, 3)) * [0.004, 0.006, 0.003] / (0.4 + views)[..., None, None]
+    covariance = factor @ factor.swapaxes(-1, -2) + 1e-6 * np.eye(3)
+    error = np.einsum("nmij,nmj->nmi", np.linalg.cholesky(covariance), rng.normal(0, 1, (n, m, 3)))
+    truth = result.sequence.truth.copy(data=result.positions - error)
+    turn = {"rotation_rad": [0.001, -0.002, 0.0005], "translation_m": [0.02, -0.01, 0.005]}
+    spread = {"rotation_rad": [4e-4, 5e-4, 3e-4], "translation_m": [0.004, 0.006, 0.003]}
+    parameters = {
+        "time_offset_s": dict(zip(names, [0.0, 0.0054, -0.0021], strict=False)),
+        "time_offset_s_sd": dict(zip(names, [0.0, 0.0004, 0.0006], strict=False)),
+        "segment_scale": {g: 1 + 0.04 * np.sin(i) for i, g in enumerate(result.skeleton.groups)},
+        "segment_scale_sd": {g: 0.005 + 0.001 * i for i, g in enumerate(result.skeleton.groups)},
+        "extrinsics": {name: turn for name in names[1:]},
+        "extrinsics_sd": {name: spread for name in names[1:]},
+        "marker_offset_m": {name: list(0.01 * rng.normal(0, 1, 3)) for name in ("spine", "nose")},
+        "noise_px": {x.name: x.sd_px * rng.uniform(0.7, 2.5) for x in result.skeleton.markers},
+    }
+    return replace(
+        result,
+        sequence=replace(result.sequence, truth=truth),
+        parameters=parameters,
+        q_sd=np.full_like(result.q, 0.04) * rng.uniform(0.5, 2.0, (n, 1)),
+        position_covariance=covariance,
+        findings=("cam2 is 5.4 ms behind the others.", "l_hip and r_hip are swapped in cam3."),
+    )
+
+
+def triangulated(result):
+    """The result as a method without a skeleton leaves it: no joints, and no position from a single view."""
+    unseen = np.isfinite(result.observed).all(-1).sum(axis=1) < 2
+    empty = np.zeros((len(result.q), 0))
+    return replace(
+        result,
+        method="tri",
+        q=empty,
+        dq=empty,
+        ddq=empty,
+        positions=np.where(unseen[..., None], np.nan, result.positions),
+        reprojected=np.where(unseen[:, None, :, None], np.nan, result.reprojected),
     )
