@@ -11,10 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib
 
+from acino_fte.parameter_table import parameter_tables
 from acino_fte.plots_histograms import camera_figure, error_figure, marker_figure
 from acino_fte.plots_joints import joint_figure, motion_figure
+from acino_fte.plots_parameters import parameter_figure
+from acino_fte.plots_positions import position_figure
 from acino_fte.plots_style import STYLE
 from acino_fte.plots_trajectory import trajectory_figure
+from acino_fte.plots_uncertainty import uncertainty_figure
 from acino_fte.plots_views import view_figure
 
 if TYPE_CHECKING:
@@ -30,14 +34,29 @@ FIGURES: dict[str, tuple[str, Callable[[FTEResult], Figure]]] = {
     "reprojection_by_camera": ("Reprojection error by camera", camera_figure),
     "reprojection_by_marker": ("Reprojection error by marker", marker_figure),
     "joint_angles": ("Joint angles and their limits", joint_figure),
+    "marker_positions": ("Positions of the markers", position_figure),
+    "uncertainty": ("Uncertainty of the markers", uncertainty_figure),
     "body_motion": ("Motion of the body", motion_figure),
+    "parameters": ("Estimated parameters", parameter_figure),
     "camera_views": ("The skeleton in the cameras", view_figure),
 }
 """File name → what it shows, and the function that draws it."""
 
 
+def figures_of(result: FTEResult) -> list[str]:
+    """Names of the figures that have something to show of a result.
+
+    ``joint_angles`` needs joints, ``uncertainty`` covariances and ``parameters`` estimated parameters;
+    ``marker_positions`` is for the methods without joints, and for error bands.
+    """
+    joints, spread = bool(result.q.shape[1]), result.position_covariance is not None
+    shown = {"joint_angles": joints, "marker_positions": spread or not joints, "uncertainty": spread}
+    shown["parameters"] = bool(parameter_tables(result.parameters))
+    return [name for name in FIGURES if shown.get(name, True)]
+
+
 def save_figures(result: FTEResult, folder: Path | str) -> list[Path]:
-    """Draw every figure of a result into a folder, which is made if need be.
+    """Draw the figures of a result (:func:`figures_of`) into a folder, which is made if need be.
 
     Parameters
     ----------
@@ -56,8 +75,8 @@ def save_figures(result: FTEResult, folder: Path | str) -> list[Path]:
     written = []
     style: Any = {**dict(matplotlib.rcParamsDefault), **STYLE}  # whatever the user's own settings are
     with matplotlib.rc_context(style):
-        for name, (_, draw) in FIGURES.items():
-            figure = draw(result)
+        for name in figures_of(result):
+            figure = FIGURES[name][1](result)
             written += [folder / f"{name}.png", folder / f"{name}.pdf"]
             figure.savefig(written[-2], dpi=DPI, metadata={"Software": None})
             figure.savefig(written[-1], metadata={"CreationDate": None, "Producer": None})

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acino_fte.metrics import NEAR_PX, point_errors, speeds
+from acino_fte.metrics import NEAR_PX, body_speed, point_errors
 from acino_fte.plots_style import (
     BLUE,
     GREEN,
@@ -16,6 +16,8 @@ from acino_fte.plots_style import (
     PALE,
     PURPLE,
     RED,
+    blank,
+    error_band,
     margins,
     new_figure,
     nothing,
@@ -33,18 +35,26 @@ _COLUMNS = 4
 
 
 def joint_figure(result: FTEResult) -> Figure:
-    """Every joint angle over time, degrees; beyond its limits shaded; left and right in one panel."""
+    """Every joint angle over time, degrees, ± 2 standard deviations where they are known.
+
+    Beyond its limits shaded; left and right in one panel.
+    """
+    if not result.q.shape[1]:
+        empty = new_figure(result, "Joint angles and their limits", 10.0, 2.0)
+        return blank(empty, "this method has no joints")
     groups = joint_groups(result.skeleton)
     rows = max(1, math.ceil(len(groups) / _COLUMNS))
     figure = new_figure(result, "Joint angles and their limits", 10.0, 1.4 + 1.35 * rows, top=1.05)
     margins(figure, 0.62, 0.15, 0.5, wspace=0.25, hspace=0.42)
     panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()  # sharing axes is slow
     height = float(figure.get_size_inches()[1])
-    keys = (
+    keys: tuple[tuple[float, str, str], ...] = (
         (0.62, "— left, or single", BLUE),
         (1.9, "— right", ORANGE),
         (2.65, "grey: outside the limits", GREY),
     )
+    if result.q_sd is not None:
+        keys += ((4.4, "band: ± 2 sd", BLUE),)
     for x, text, colour in keys:
         figure.text(x / 10, 1 - 0.7 / height, text, color=colour, fontsize=8.5)
     for axes, group in zip(panels, groups, strict=False):
@@ -70,9 +80,18 @@ def _joint_panel(axes: Axes, result: FTEResult, group: list[int]) -> None:
     axes.locator_params(axis="x", nbins=4)
     axes.set_title(_panel_title([dof.name for dof in dofs]), fontsize=8.5, loc="left", pad=3)
     lower, upper = np.degrees(dofs[0].lower), np.degrees(dofs[0].upper)
-    if not (math.isfinite(lower) and math.isfinite(upper)):
+    if math.isfinite(lower) and math.isfinite(upper):
+        _show_limits(axes, values, lower, upper)
+    else:
         _at_least(axes, 20.0)
-        return
+    if result.q_sd is not None:
+        deviations = np.degrees(result.q_sd[:, group])
+        for column, sd, colour in zip(values.T, deviations.T, (BLUE, ORANGE), strict=False):
+            error_band(axes, times(result), column, sd, colour)
+
+
+def _show_limits(axes: Axes, values: np.ndarray, lower: float, upper: float) -> None:
+    """Shade what is beyond the limits, degrees, and put the ticks between them."""
     room = 0.08 * (upper - lower)
     bottom, top = min(lower, values.min()) - room, max(upper, values.max()) + room
     for start, stop in ((bottom, lower), (upper, top)):
@@ -120,7 +139,8 @@ def _panel_title(names: list[str]) -> str:
 
 def motion_figure(result: FTEResult) -> Figure:
     """Translation of the root and speed of the body over time, and how many observations there were."""
-    slides = [j for j, dof in enumerate(result.skeleton.dofs) if dof.kind == "slide"]
+    dofs = result.skeleton.dofs if result.q.shape[1] else ()
+    slides = [j for j, dof in enumerate(dofs) if dof.kind == "slide"]
     n_panels = len(slides) + 3
     columns = min(3, n_panels)
     rows = math.ceil(n_panels / columns)
@@ -134,6 +154,8 @@ def motion_figure(result: FTEResult) -> Figure:
         axes.set_title(result.skeleton.dofs[j].name.replace(".", " · "), loc="left")
         axes.set_ylabel("Position (m)")
         _at_least(axes, 0.2)
+        if result.q_sd is not None:
+            error_band(axes, time, result.q[:, j], result.q_sd[:, j], BLUE)
     _speed_panel(panels[len(slides)], result)
     counts = np.isfinite(result.observed).all(-1).sum(axis=(1, 2))
     axes = panels[len(slides) + 1]
@@ -156,14 +178,18 @@ def _speed_panel(axes: Axes, result: FTEResult) -> None:
     if len(result.positions) < 2:
         nothing(axes, "one frame has no speed")
         return
-    speed = speeds(result.positions.mean(axis=1), result.sequence.fps)
+    speed = body_speed(result.positions, result.sequence.fps)
+    if not np.isfinite(speed).any():
+        nothing(axes, "no positions")
+        return
+    middle = np.nanmedian(speed)
     axes.plot(times(result), speed, color=BLUE)
-    axes.axhline(np.median(speed), color=RED, lw=1, ls="--")
-    axes.set_ylim(0, 1.15 * max(speed.max(), 1e-3))
+    axes.axhline(middle, color=RED, lw=1, ls="--")
+    axes.set_ylim(0, 1.15 * max(np.nanmax(speed), 1e-3))
     axes.text(
         0.99,
         0.04,
-        f"median {np.median(speed):.2f} m/s",
+        f"median {middle:.2f} m/s",
         transform=axes.transAxes,
         ha="right",
         color=RED,
@@ -173,7 +199,7 @@ def _speed_panel(axes: Axes, result: FTEResult) -> None:
 
 def _error_panel(axes: Axes, result: FTEResult) -> None:
     """Median reprojection error of every frame that has observations."""
-    errors = point_errors(result).reshape(len(result.q), -1)
+    errors = point_errors(result).reshape(len(result.positions), -1)
     seen = ~np.isnan(errors).all(axis=1)
     axes.set_title("Median reprojection error in a frame", loc="left")
     axes.set_ylabel("Error (px)")

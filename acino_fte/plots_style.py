@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 # Okabe and Ito 2008, Color Universal Design: told apart with every kind of colour blindness.
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
 GREY, PALE = "#666666", "#E8E8E8"
+BAND_SD = 2.0
+"""Half width of error bands and bars, and half axes of error ellipses, in standard deviations."""
 TIME_MAP = "viridis"  # even in lightness, safe for colour-blind readers
 
 STYLE: dict[str, Any] = {
@@ -74,6 +77,28 @@ def margins(figure: Figure, left: float, right: float, bottom: float, **space: f
 def nothing(axes: Axes, text: str = "no observations") -> None:
     """Say that a panel has nothing to show."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=GREY)
+
+
+def keys(figure: Figure, entries: Iterable[tuple[str, str]], left: float, below: float) -> None:
+    """Write what the colours mean in one line: (text, colour), from ``left``, ``below`` the top, in."""
+    width, height = figure.get_size_inches()
+    for text, colour in entries:
+        figure.text(left / width, 1 - below / height, text, color=colour, fontsize=8.5)
+        left += 0.28 + 0.07 * len(text)
+
+
+def blank(figure: Figure, text: str) -> Figure:
+    """The figure with nothing in it but a reason."""
+    nothing(figure.add_subplot(frameon=False, xticks=(), yticks=()), text)
+    return figure
+
+
+def error_band(axes: Axes, x: np.ndarray, values: np.ndarray, sd: np.ndarray, colour: str) -> None:
+    """Shade ± 2 standard deviations about values (N,); the limits of the axes stay as they are."""
+    limits = axes.get_xlim(), axes.get_ylim()
+    low, high = values - BAND_SD * sd, values + BAND_SD * sd
+    axes.fill_between(x, low, high, color=colour, alpha=0.22, lw=0)
+    axes.set(xlim=limits[0], ylim=limits[1])
 
 
 def times(result: FTEResult) -> np.ndarray:

@@ -1,7 +1,8 @@
 """The trajectory as stick figures over time: in three dimensions, from the side and from above.
 
 All three panels are in the frame of travel: along the direction of travel, to its left, and up, with equal
-scales. The 3D panel is a parallel projection (no foreshortening with distance, so lengths compare).
+scales. The 3D panel is a parallel projection (no foreshortening with distance, so lengths compare). Markers
+without a position are left out, and so are the lines to them.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
+from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import ListedColormap, Normalize
 
-from acino_fte.plots_style import GREY, TIME_MAP, new_figure, times
+from acino_fte.plots_style import BAND_SD, GREY, TIME_MAP, blank, new_figure, times
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,7 +31,12 @@ _COLOURS = ListedColormap(colormaps[TIME_MAP](np.linspace(0.0, 0.9, 256)))  # th
 
 
 def trajectory_figure(result: FTEResult) -> Figure:
-    """Skeletons at about 14 instants, coloured by time, equal scales on all axes, metres."""
+    """Skeletons at about 14 instants, coloured by time, equal scales on all axes, metres.
+
+    From the side and above with the markers' error ellipses (2 standard deviations) where they are known.
+    """
+    if not np.isfinite(result.positions).all(-1).any():
+        return blank(new_figure(result, "Trajectory", _WIDTH, 2.0), "no positions")
     chosen = pose_frames(len(result.positions))
     along, local = travel_frame(result.positions)
     norm = Normalize(*times(result)[[0, -1]])
@@ -46,14 +52,18 @@ def trajectory_figure(result: FTEResult) -> Figure:
     panels[0].add_collection(LineCollection(list(view(segments)), colors=shades, lw=1.1))
     for axes, vertical in zip(panels[1:], (2, 1), strict=True):
         axes.add_collection(LineCollection(list(segments[..., [0, vertical]]), colors=shades, lw=1.0))
-        centre = local.mean(axis=1)
+        if result.position_covariance is not None:
+            spread = _turned(result.position_covariance[chosen], along)
+            _draw_ellipses(axes, local[chosen], spread, vertical, colours)
+        centre = body_centre(local)
         axes.plot(centre[:, 0], centre[:, vertical], color=GREY, lw=0.7, ls=":")
         axes.grid(True, lw=0.3, color="#CCCCCC")
         axes.set_axisbelow(True)
     panels[1].set_ylabel("Height (m)")
-    panels[1].set_title("From the side", loc="left", pad=3)
+    shaded = "" if result.position_covariance is None else f"; shaded: {BAND_SD:g} sd of the markers"
+    panels[1].set_title(f"From the side{shaded}", loc="left", pad=3)
     panels[2].set_ylabel("To the left (m)")
-    panels[2].set_title("From above; dotted: mean of all markers", loc="left", pad=3)
+    panels[2].set_title("From above; dotted: mean of the markers", loc="left", pad=3)
     heading = np.degrees(np.arctan2(along[1], along[0]))
     panels[2].set_xlabel(
         f"Along the direction of travel (m), which is {heading:.0f}° from world x".replace("-", "−")
@@ -87,7 +97,7 @@ def _layout(result: FTEResult, boxes: list[tuple[np.ndarray, np.ndarray]]) -> tu
 
 def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the box around points, with a margin."""
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     margin = 0.015 * float((high - low).max()) + 0.02
     return low - margin, high + margin
 
@@ -102,26 +112,74 @@ def travel_frame(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     The direction is the displacement of the body; of a body that hardly moves, its longer horizontal axis.
     """
-    centre = positions.mean(axis=1)
-    shift = (centre[-1] - centre[0])[:2]
+    centre = body_centre(positions)
+    path = centre[np.isfinite(centre).all(-1)]
+    shift = (path[-1] - path[0])[:2]
     spread = (positions - centre[:, None])[..., :2].reshape(-1, 2)
+    spread = spread[np.isfinite(spread).all(-1)]
     if np.linalg.norm(shift) < 2 * spread.std():
         shift = np.linalg.svd(spread - spread.mean(0), full_matrices=False)[2][0]
         shift = shift if shift[0] > 0 else -shift
     along = np.array([*(shift / max(np.linalg.norm(shift), 1e-12)), 0.0])
-    left = np.array([-along[1], along[0], 0.0])
-    local = np.stack([positions @ along, positions @ left, positions[..., 2]], axis=-1)
-    local[..., :2] -= local[0].mean(axis=0)[:2]
+    local = positions @ travel_axes(along).T
+    start = body_centre(local)
+    local[..., :2] -= start[np.isfinite(start).all(-1)][0, :2]
     return along, local
+
+
+def body_centre(positions: np.ndarray) -> np.ndarray:
+    """(N, 3) mean of the markers that have a position in a frame; NaN where none has."""
+    there = np.isfinite(positions).all(-1)
+    count = np.where(there.any(axis=1), there.sum(axis=1), np.nan)
+    return np.where(there[..., None], positions, 0.0).sum(axis=1) / count[:, None]
+
+
+def travel_axes(along: np.ndarray) -> np.ndarray:
+    """Rows: the direction of travel, to its left, and up, in the world frame (3, 3)."""
+    return np.array([along, [-along[1], along[0], 0.0], [0.0, 0.0, 1.0]])
+
+
+def _turned(covariance: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Covariances (…, 3, 3) in the frame of travel."""
+    frame = travel_axes(along)
+    return frame @ covariance @ frame.T
+
+
+def _draw_ellipses(
+    axes: Axes, points: np.ndarray, covariance: np.ndarray, vertical: int, colours: np.ndarray
+) -> None:
+    """Error ellipses of points (P, M, 3) in the plane of ``along`` and a second axis."""
+    plane = np.array([0, vertical])
+    flat = covariance[..., plane[:, None], plane]
+    known = np.isfinite(flat).all((-2, -1)) & np.isfinite(points).all(-1)
+    variances, directions = np.linalg.eigh(flat[known])
+    diameters = 2 * BAND_SD * np.sqrt(np.maximum(variances, 0.0))
+    axes.add_collection(
+        EllipseCollection(
+            diameters[:, 1],
+            diameters[:, 0],
+            np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1])),
+            units="xy",
+            offsets=points[known][:, plane],
+            offset_transform=axes.transData,
+            facecolors=np.broadcast_to(colours[:, None], (*known.shape, 4))[known],
+            alpha=0.18,
+            lw=0,
+        )
+    )
 
 
 def sticks(
     result: FTEResult, points: np.ndarray, chosen: np.ndarray, colours: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Segments (S, 2, D) of the skeleton's edges in the chosen frames, and their colours (S, 4)."""
+    """Segments (S, 2, D) of the skeleton's edges in the chosen frames, and their colours (S, 4).
+
+    Edges to a marker without a position are left out.
+    """
     edges = np.array(result.skeleton.edges, dtype=int).reshape(-1, 2)
-    segments = points[chosen][:, edges]
-    return segments.reshape(-1, 2, points.shape[-1]), np.repeat(colours, len(edges), axis=0)
+    segments = points[chosen][:, edges].reshape(-1, 2, points.shape[-1])
+    whole = np.isfinite(segments).all((-2, -1))
+    return segments[whole], np.repeat(colours, len(edges), axis=0)[whole]
 
 
 def view(local: np.ndarray) -> np.ndarray:
@@ -139,7 +197,7 @@ def _place(point: tuple[float, float, float]) -> tuple[float, float]:
 
 def ground_grid(local: np.ndarray) -> list[np.ndarray]:
     """Values of the grid lines along, to the left, and up (the first is the ground), m."""
-    low, high = local.reshape(-1, 3).min(axis=0), local.reshape(-1, 3).max(axis=0)
+    low, high = np.nanmin(local.reshape(-1, 3), axis=0), np.nanmax(local.reshape(-1, 3), axis=0)
     length = max(high[0] - low[0], high[1] - low[1])
     step = next((s for s in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0) if length / s <= 14), length / 10)
     lines = [np.arange(np.floor(low[i] / step), np.ceil(high[i] / step) + 1) * step for i in (0, 1)]

@@ -1,6 +1,7 @@
 """The report of a run: one HTML page with everything inside, that opens without a network.
 
-Whatever comes from files (names, warnings, options) is escaped.
+Whatever comes from files (names, warnings, findings) is escaped. The tables are in
+:mod:`acino_fte.report_tables`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 from acino_fte.report_page import PAGE, SCRIPT, STYLE, VIEWER
 from acino_fte.report_scene import scene
+from acino_fte.report_tables import (
+    error_tables,
+    number,
+    parameter_section,
+    run_tables,
+    share,
+    uncertainty_section,
+)
 from acino_fte.result import Status
 
 if TYPE_CHECKING:
@@ -43,13 +52,17 @@ def write_report(result: FTEResult, folder: Path | str) -> Path:
     folder = Path(folder)
     metrics = result.metrics
     data = scene(result)
+    usual_px = {marker.name: marker.sd_px for marker in result.skeleton.markers}
     sections = [
         _cards(metrics),
+        _findings(metrics["findings"]),
         _warnings(metrics),
         "<h2>The trajectory</h2>" + VIEWER.replace("@grid@", f"{data['grid']['step']:g}"),
         _figures(folder / "figures"),
-        "<h2>Reprojection error</h2>" + _error_tables(metrics["reprojection_px"]),
-        "<h2>The run</h2>" + _run_tables(metrics),
+        "<h2>Reprojection error</h2>" + error_tables(metrics["reprojection_px"]),
+        parameter_section(result.parameters, metrics.get("parameter_errors", {}), usual_px),
+        uncertainty_section(metrics.get("uncertainty", {}), metrics.get("truth_mm", {})),
+        "<h2>The run</h2>" + run_tables(metrics),
     ]
     fields = {
         "title": escape(f"{metrics['sequence']}: {metrics['species']} in 3D"),
@@ -102,10 +115,20 @@ def _cards(metrics: dict[str, Any]) -> str:
         (number(metrics["speed_m_s"]["body"], "m/s", 2), "median speed of the body"),
         (number(seconds["total"], "s", 2), f"in all; {number(metrics['realtime_factor'], '×', 2)} real time"),
     ]
+    if "uncertainty" in metrics:
+        cards.append((number(metrics["uncertainty"]["median_sd_mm"], "mm"), "median sd of a marker"))
+    if (error["coverage"] or 0.0) < 1.0:
+        cards.append((share(error["coverage"]), "of the observed markers have a position"))
     if "truth_mm" in metrics:
         cards.append((number(metrics["truth_mm"]["mpjpe"], "mm", 2), "mean distance to the truth"))
     items = "".join(f'<div class="card"><b>{escape(v)}</b><span>{escape(t)}</span></div>' for v, t in cards)
     return f'<div class="cards">{items}</div>'
+
+
+def _findings(findings: Iterable[str]) -> str:
+    """What the estimate noticed about the recording."""
+    items = "".join(f"<li>{escape(str(text))}</li>" for text in findings)
+    return f'<h2>What the estimate found</h2><ul class="findings">{items}</ul>' if items else ""
 
 
 def _warnings(metrics: dict[str, Any]) -> str:
@@ -160,79 +183,3 @@ def _shrink(path: Path) -> bytes:
     buffer = BytesIO()
     small.quantize(_COLOURS, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=False)
     return buffer.getvalue()
-
-
-def _error_tables(error: dict[str, Any]) -> str:
-    head = ("", "median (px)", "mean (px)", "p90 (px)", "within 20 px", "n")
-    overall = [("median", error["median"]), ("mean", error["mean"]), ("RMSE", error["rmse"])]
-    overall += [("standard deviation", error["std"]), ("90th percentile", error["p90"])]
-    rows = [(name, number(value, "px", 2)) for name, value in overall]
-    rows += [("within 20 px", share(error["within_20px"], 1))]
-    rows += [(f"beyond {error['outlier_beyond_sd']:g} sd", share(error["outlier_ratio"], 1))]
-    rows += [("behind the camera", f"{error['n_behind_camera']:,}")]
-    tables = [_table("All observations", ("", ""), rows)]
-    for key, caption in (("per_camera", "By camera"), ("per_marker", "By marker")):
-        lines = [
-            (
-                name,
-                *(number(part[k], "", 1) for k in ("median", "mean", "p90")),
-                share(part["within_20px"]),
-                f"{part['n']:,}",
-            )
-            for name, part in error[key].items()
-        ]
-        bad = {name for name, part in error[key].items() if (part["within_20px"] or 0.0) < 0.5}
-        tables.append(_table(caption + "; shaded: under half within 20 px", head, lines, bad))
-    return f'<div class="tables">{"".join(tables)}</div>'
-
-
-def _run_tables(metrics: dict[str, Any]) -> str:
-    facts = [(key, metrics[key]) for key in ("status", "method", "version", "iterations", "n_markers")]
-    facts.append(("objective", number(metrics["objective"], "", 4)))
-    facts += [(f"truth: {key}", number(v, "mm", 2)) for key, v in metrics.get("truth_mm", {}).items()]
-    times = [(key, number(value, "s", 3)) for key, value in metrics["seconds"].items()]
-    limits = [(name, share(part)) for name, part in metrics["joints_at_limit"].items()]
-    tables = [_table("Result", ("", ""), facts), _table("Time", ("", ""), times)]
-    if limits:
-        tables.append(_table("At a limit, share of the frames", ("", ""), limits))
-    for key, caption in (("parameters", "Estimated parameters"), ("options", "Options")):
-        rows = list(_flat(metrics[key]))
-        if rows:
-            tables.append(_table(caption, ("", ""), rows))
-    return f'<div class="tables">{"".join(tables)}</div>'
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
-    """Nested options as rows ``solve.max_iter``, value."""
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-
-
-def _table(caption: str, head: Iterable[str], rows: Iterable[Iterable[Any]], bad: Iterable[str] = ()) -> str:
-    """An HTML table; rows whose first cell is in ``bad`` are shaded."""
-    titles = "".join(f"<th>{escape(title)}</th>" for title in head)
-    start = f"<thead><tr>{titles}</tr></thead>" if any(head) else ""
-    marked = set(bad)
-    lines = []
-    for first, *rest in rows:
-        cells = "".join(_cell(str(cell), first in marked) for cell in rest)
-        lines.append(f"<tr><td>{escape(str(first))}</td>{cells}</tr>")
-    return f"<table><caption>{escape(caption)}</caption>{start}<tbody>{''.join(lines)}</tbody></table>"
-
-
-def _cell(text: str, bad: bool) -> str:
-    kind = ' class="bad"' if bad else ' class="text"' if len(text) > 24 else ""
-    return f"<td{kind}>{escape(text)}</td>"
-
-
-def number(value: float | None, unit: str, digits: int = 1) -> str:
-    """``12.3 px``; a dash when undefined."""
-    return "–" if value is None else f"{value:,.{digits}f} {unit}".rstrip()
-
-
-def share(value: float | None, digits: int = 0) -> str:
-    """``76 %``; a dash when undefined."""
-    return "–" if value is None else f"{100 * value:.{digits}f} %"

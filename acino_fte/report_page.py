@@ -57,6 +57,8 @@ td.bad { background: #fbe3d8; }
 thead th { border-bottom: 1px solid #999; font-weight: 600; }
 ul.warnings { background: #fff6df; border-left: 4px solid #e69f00;
   padding: .6rem .8rem .6rem 2rem; margin: 1.2rem 0 0; }
+ul.findings { background: #e8f1fa; border-left: 4px solid #0072b2;
+  padding: .6rem .8rem .6rem 2rem; margin: 0; font-size: 1.02rem; }
 figure { margin: 0 0 1.6rem; } figure img { max-width: 100%; height: auto; display: block; }
 figcaption { color: var(--soft); font-size: .86rem; }
 #viewer { position: relative; border: 1px solid var(--line); border-radius: 6px; overflow: hidden; }
@@ -113,11 +115,15 @@ SCRIPT = """
     const at = 3 * (f * m + i);
     return [data.positions[at] / 1000, data.positions[at + 1] / 1000, data.positions[at + 2] / 1000];
   }
+  const known = (f, i) => data.positions[3 * (f * m + i)] !== null;
   const centres = data.frames.map((_, f) => {
+    const there = [...Array(m).keys()].filter((i) => known(f, i));
     const sum = [0, 0, 0];
-    for (let i = 0; i < m; i++) { point(f, i).forEach((v, a) => { sum[a] += v / m; }); }
-    return sum;
+    there.forEach((i) => { point(f, i).forEach((v, a) => { sum[a] += v / there.length; }); });
+    return there.length ? sum : null;
   });
+  const first = centres.find((c) => c) || [0, 0, 0];  // frames without a marker keep the last place
+  for (let f = 0; f < n; f++) { centres[f] = centres[f] || (f ? centres[f - 1] : first); }
   function reset() {
     const d = [centres[n - 1][0] - centres[0][0], centres[n - 1][1] - centres[0][1]];
     const heading = Math.hypot(d[0], d[1]) > 0.3 ? Math.atan2(d[1], d[0]) : 0;
@@ -198,10 +204,11 @@ SCRIPT = """
     if (element("cameras").checked) { cameras(); }
     for (let f = 1; f < n; f++) { line(centres[f - 1], centres[f], f <= frame ? "#888888" : "#cccccc", 1); }
     const flat = (p) => [p[0], p[1], data.grid.z];
-    data.edges.forEach((e) => { line(flat(point(frame, e[0])), flat(point(frame, e[1])), "#d0d0d0", 2); });
-    data.edges.forEach((e) => { line(point(frame, e[0]), point(frame, e[1]), sideColour[e[2]], 2.5); });
+    const edges = data.edges.filter((e) => known(frame, e[0]) && known(frame, e[1]));
+    edges.forEach((e) => { line(flat(point(frame, e[0])), flat(point(frame, e[1])), "#d0d0d0", 2); });
+    edges.forEach((e) => { line(point(frame, e[0]), point(frame, e[1]), sideColour[e[2]], 2.5); });
     data.markers.forEach((marker, i) => {
-      const a = project(point(frame, i));
+      const a = known(frame, i) ? project(point(frame, i)) : null;
       if (!a) { return; }
       const views = data.views[frame * m + i];
       pen.beginPath(); pen.arc(a[0], a[1], 3.2, 0, 7);

@@ -19,16 +19,15 @@ def scene(result: FTEResult) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``positions`` (frames · markers · 3), whole mm, world frame; ``views`` (frames · markers), cameras
-        that saw the marker; ``frames`` and ``every`` (the step between them); ``fps``; ``markers`` with
-        name and side; ``edges`` [marker, marker, side]; ``cameras`` with poses [centre, right, down,
-        forward] in m, one, or one a frame; ``grid``; ``size`` of the animal, m.
+        ``positions`` (frames · markers · 3), whole mm, world frame, None where missing; ``views``
+        (frames · markers), cameras that saw the marker; ``frames`` and ``every`` (the step between them);
+        ``fps``; ``markers`` with name and side; ``edges`` [marker, marker, side]; ``cameras`` with poses
+        [centre, right, down, forward] in m, one, or one a frame; ``grid``; ``size`` of the animal, m.
     """
     every = -(-len(result.positions) // _MOST_FRAMES)
     positions = result.positions[::every]
     seen = np.isfinite(result.observed).all(-1).sum(axis=1)[::every]
     sides = marker_sides(result)
-    extent = np.ptp(positions, axis=1).max(axis=1)
     names = result.skeleton.marker_names
     return {
         "frames": [int(f) for f in result.sequence.frames[::every]],
@@ -36,12 +35,24 @@ def scene(result: FTEResult) -> dict[str, Any]:
         "fps": float(result.sequence.fps),
         "markers": [{"name": name, "side": side} for name, side in zip(names, sides, strict=True)],
         "edges": [[a, b, sides[b] if sides[a] == "middle" else sides[a]] for a, b in result.skeleton.edges],
-        "positions": np.round(1000 * positions).astype(int).ravel().tolist(),
+        "positions": [int(v) if np.isfinite(v) else None for v in np.round(1000 * positions).ravel()],
         "views": seen.ravel().tolist(),
         "cameras": [_camera(camera, every) for camera in result.sequence.cameras],
         "grid": ground_grid(positions),
-        "size": round(float(np.median(extent)), 3),
+        "size": body_size(positions),
     }
+
+
+def body_size(positions: np.ndarray) -> float:
+    """Median over the frames of the greatest extent of the markers (N, M, 3) along an axis, m.
+
+    Frames without two markers do not count; 1 when there are none.
+    """
+    there = np.isfinite(positions).all(-1)
+    seen = there.sum(axis=1) > 1
+    frames = np.where(there[seen][..., None], positions[seen], np.nan)
+    extent = (np.nanmax(frames, axis=1) - np.nanmin(frames, axis=1)).max(axis=1)
+    return round(float(np.median(extent)), 3) if extent.size else 1.0
 
 
 def marker_sides(result: FTEResult) -> list[str]:
@@ -72,7 +83,9 @@ def _camera(camera: Camera, every: int) -> dict[str, Any]:
 
 def ground_grid(positions: np.ndarray) -> dict[str, float]:
     """A grid on the ground under positions (N, M, 3): at most 40 lines each way, in steps of 1, 2 or 5, m."""
-    low, high = positions.reshape(-1, 3).min(axis=0), positions.reshape(-1, 3).max(axis=0)
+    points = positions[np.isfinite(positions).all(-1)]
+    points = points if len(points) else np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
+    low, high = points.min(axis=0), points.max(axis=0)
     length = float(max(high[:2] - low[:2]))
     steps = [base * 10.0**power for power in range(-2, 5) for base in (1, 2, 5)]
     step = next((s for s in steps if length / s <= 20), length / 20)

@@ -4,11 +4,13 @@ from io import BytesIO
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.collections import EllipseCollection, PolyCollection
 from matplotlib.image import imread
-from synthetic_result import make_result
+from synthetic_result import make_result, triangulated, with_estimates
 
-from acino_fte.plots import FIGURES, save_figures
+from acino_fte.plots import FIGURES, figures_of, save_figures
 from acino_fte.plots_joints import joint_groups
+from acino_fte.plots_positions import smooth_path
 from acino_fte.plots_style import STYLE
 from acino_fte.plots_trajectory import pose_frames, travel_frame, view
 from acino_fte.plots_views import best_frame
@@ -33,7 +35,7 @@ def words(figure):
 def test_every_figure_as_png_and_pdf(result, tmp_path):
     before = dict(matplotlib.rcParams)
     written = save_figures(result, tmp_path / "figures")
-    assert {p.name for p in written} == {f"{n}.{kind}" for n in FIGURES for kind in ("png", "pdf")}
+    assert {p.name for p in written} == {f"{n}.{kind}" for n in figures_of(result) for kind in ("png", "pdf")}
     assert dict(matplotlib.rcParams) == before
     for path in written:
         assert path.stat().st_size > 5000
@@ -89,7 +91,7 @@ def test_unusual_results_are_drawn(result, case):
         result = replace(result, reprojected=np.full_like(result.reprojected, np.nan))
     else:
         result = replace(result, sequence=replace(result.sequence, name="$x_{1} & <b> \\alpha"))
-    for _, draw in FIGURES.values():
+    for draw in (FIGURES[name][1] for name in figures_of(result)):
         image = BytesIO()
         draw(result).savefig(image, format="png", dpi=40)
         assert len(image.getvalue()) > 1000
@@ -136,3 +138,84 @@ def test_best_frame_is_in_the_middle_third(result):
     observed[0] = 1.0
     observed[9, 0, :3] = 1.0
     assert best_frame(replace(result, observed=observed)) == 9
+
+
+def test_figures_follow_what_there_is(result):
+    plain = set(figures_of(result))
+    assert plain == set(FIGURES) - {"marker_positions", "uncertainty", "parameters"}
+    assert set(figures_of(with_estimates(result))) == set(FIGURES)
+    assert set(figures_of(triangulated(result))) == plain - {"joint_angles"} | {"marker_positions"}
+
+
+@pytest.mark.parametrize("case", ["estimated", "triangulated", "no position"])
+def test_results_of_other_methods_are_drawn(result, case):
+    if case == "estimated":
+        result = with_estimates(result)
+        names = ["trajectory", "joint_angles", "body_motion", "marker_positions", "uncertainty", "parameters"]
+    else:
+        result = triangulated(result)
+        names = ["trajectory", "joint_angles", "body_motion", "marker_positions", "reprojection_by_marker"]
+    if case == "no position":
+        nothing = np.full_like(result.positions, np.nan)
+        result = replace(
+            result,
+            positions=nothing,
+            reprojected=np.full_like(result.reprojected, np.nan),
+            position_covariance=np.full((*nothing.shape, 3), np.nan),
+        )
+        names += ["uncertainty", "parameters", "reprojection_error", "camera_views"]
+    for name in names:
+        image = BytesIO()
+        FIGURES[name][1](result).savefig(image, format="png", dpi=40)
+        assert len(image.getvalue()) > 1000
+
+
+def bands(figure, kind):
+    return sum(isinstance(a, kind) for axes in figure.axes for a in axes.collections)
+
+
+def test_bands_where_there_are_deviations(result):
+    estimated = with_estimates(result)
+    assert bands(FIGURES["joint_angles"][1](result), PolyCollection) == 0
+    turns = sum(dof.kind == "turn" for dof in result.skeleton.dofs)
+    assert bands(FIGURES["joint_angles"][1](estimated), PolyCollection) == turns
+    assert bands(FIGURES["body_motion"][1](estimated), PolyCollection) == 3
+    assert bands(FIGURES["marker_positions"][1](estimated), PolyCollection) == 3 * 24
+    assert bands(FIGURES["trajectory"][1](estimated), EllipseCollection) == 2
+    assert bands(FIGURES["trajectory"][1](result), EllipseCollection) == 0
+
+
+def test_ellipses_have_two_standard_deviations(result):
+    covariance = np.broadcast_to(np.diag([9e-4, 4e-4, 1e-4]), (*result.positions.shape, 3))
+    straight = result.positions[:1] + np.arange(20)[:, None, None] * np.array([0.1, 0.0, 0.0])
+    figure = FIGURES["trajectory"][1](replace(result, positions=straight, position_covariance=covariance))
+    side, above = (c for axes in figure.axes for c in axes.collections if isinstance(c, EllipseCollection))
+    np.testing.assert_allclose(side.get_widths(), 4 * 0.03)
+    np.testing.assert_allclose(side.get_heights(), 4 * 0.01)
+    np.testing.assert_allclose(above.get_heights(), 4 * 0.02)
+    np.testing.assert_allclose(np.mod(above.get_angles() + 90, 180), 90, atol=1e-6)
+
+
+def test_the_parameter_figure_shows_units_and_the_truth(result):
+    estimated = with_estimates(result)
+    plain = words(FIGURES["parameters"][1](estimated))
+    labels = ("Offset (ms)", "Factor", "Angle (°)", "Shift (cm)", "Shift (mm)", "Noise (px)", "cam2", "neck")
+    assert [label for label in labels if label not in plain] == []
+    assert "× true" not in plain
+    sequence = replace(estimated.sequence)
+    object.__setattr__(sequence, "truth_parameters", {"time_offset_s": {"cam2": 0.005}})
+    figure = FIGURES["parameters"][1](replace(estimated, sequence=sequence))
+    assert "× true" in words(figure)
+    (panel,) = (axes for axes in figure.axes if axes.get_xlabel() == "Offset (ms)")
+    (cross,) = (line for line in panel.lines if line.get_marker() == "x")
+    assert (cross.get_xdata()[0], cross.get_ydata()[0]) == (pytest.approx(5.0), 1)
+
+
+def test_smooth_path_does_not_jump_when_markers_go(result):
+    time = np.arange(20) / 120
+    positions = np.arange(24)[:, None] * np.ones(3) * 0.01 + 5.0 * time[:, None, None]
+    positions[:, 12:] = positions[:, 11:12]
+    whole = smooth_path(time, positions)
+    np.testing.assert_allclose(np.diff(whole, axis=0), 5.0 / 120, atol=1e-9)
+    positions[10:, :3] = np.nan
+    assert np.abs(np.diff(smooth_path(time, positions), axis=0) - 5.0 / 120).max() < 0.005

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from PIL import Image
-from synthetic_result import make_result
+from synthetic_result import make_result, triangulated, with_estimates
 
 from acino_fte.plots import FIGURES
 from acino_fte.report import _fill, headline_colour, number, share, write_report
@@ -69,7 +69,7 @@ def test_is_well_formed_and_needs_no_network(result, tmp_path):
     assert parser.open == []
     assert "http" not in re.sub(r"http-equiv", "", page)
     images = [attrs["src"] for tag, attrs in parser.seen if tag == "img"]
-    assert len(images) == 7
+    assert len(images) == len(FIGURES)
     assert all(src.startswith("data:image/png;base64,") for src in images)
     assert not any(attrs.get("src") for tag, attrs in parser.seen if tag in ("script", "link", "iframe"))
     assert len(page) < 3e6
@@ -163,3 +163,36 @@ def test_ground_grid_holds_the_animal():
     assert grid["y0"] < -3 < 2 < grid["y1"]
     assert grid["z"] == 0.0
     assert grid["step"] == 2.0
+
+
+def test_findings_parameters_and_uncertainty(result, tmp_path):
+    estimated = with_estimates(result)
+    findings = (*estimated.findings, HOSTILE)
+    parameters = {**estimated.parameters, "mode": {"kind": HOSTILE}}
+    page = page_of(replace(estimated, findings=findings, parameters=parameters), tmp_path)
+    parser = Balance()
+    parser.feed(page)
+    assert parser.faults == parser.open == []
+    assert page.index("cam2 is 5.4 ms behind") < page.index('id="viewer"')
+    assert "alert(1)</script>" not in page
+    for text in ("Time offset of the camera (ms), ± sd", "5.40 ± 0.40", "Rotation of the camera (°), ± sd"):
+        assert text in page
+    assert "−0.115 ± 0.029" in page
+    sd_px = result.skeleton.markers[result.skeleton.marker("spine")].sd_px
+    assert f"<td>spine</td><td>{estimated.parameters['noise_px']['spine']:.2f}</td><td>{sd_px:.2f}" in page
+    found = estimated.metrics["uncertainty"]
+    assert number(found["predicted_rmse_mm"], "mm", 2) in page
+    assert share(found["ellipsoid_coverage_95"], 1) in page
+    plain = page_of(result, tmp_path)
+    assert "<h2>Uncertainty" not in plain and "<h2>Estimated parameters" not in plain
+
+
+def test_page_of_a_method_without_a_skeleton(result, tmp_path):
+    sparse = triangulated(result)
+    data = data_of(page_of(sparse, tmp_path))
+    positions = np.array(data["positions"], dtype=float).reshape(8, 24, 3) / 1000
+    np.testing.assert_allclose(positions, sparse.positions, atol=6e-4)
+    assert data["size"] == pytest.approx(scene(result)["size"], rel=0.3)
+    nowhere = scene(replace(sparse, positions=np.full_like(sparse.positions, np.nan)))
+    assert nowhere["size"] == 1.0
+    assert nowhere["grid"]["x0"] < nowhere["grid"]["x1"]
