@@ -11,116 +11,24 @@ import os
 import shutil
 from pathlib import Path
 from secrets import token_hex
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 import yaml
 
 from acino_fte.errors import InputError
 from acino_fte.metrics import json_safe
+from acino_fte.result_dataset import to_dataset
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from acino_fte.result import FTEResult
 
 FILES = ("fte.nc", "positions.csv", "states.csv", "metrics.json", "sequence.yaml", "figures", "report.html")
-"""What a result folder may hold."""
+"""What a result folder may hold; ``states.csv`` only from a method with a skeleton."""
 _MARKS = ("fte.nc", "metrics.json")  # a folder that holds both is a result
 _ANOTHER = "choose another output folder with -o"
-
-
-def to_dataset(result: FTEResult) -> xr.Dataset:
-    """Everything as one labelled dataset, in the layout of the movement package.
-
-    Parameters
-    ----------
-    result : FTEResult
-        In whatever status it is.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``position`` (time, space, keypoints, individuals), m, world frame; ``confidence`` (time,
-        keypoints, individuals), mean likelihood of the detections used, NaN where there was none;
-        ``n_views`` likewise, how many there were; ``q``, ``dq``, ``ddq`` (time, dof), m and rad as the
-        coordinate ``dof_unit`` says; ``detection`` and ``residual`` = reprojected − detected (time,
-        camera, keypoints, pixel), px. Coordinates ``time`` (s, from the start of the recording) and
-        ``frame`` along it. The attributes carry status, fps, method, version, units and options.
-
-    References
-    ----------
-    The movement package, https://movement.neuroinformatics.dev: its dataset of poses.
-    """
-    seen = np.isfinite(result.observed).all(-1)
-    keypoints = ("time", "keypoints", "individuals")
-    pixels = ("time", "camera", "keypoints", "pixel")
-    position = result.positions.transpose(0, 2, 1)[..., None]
-    confidence = _confidence(result, seen)[..., None]
-    variables = {
-        "position": (("time", "space", *keypoints[1:]), position, _note("position, world frame", "m")),
-        "confidence": (keypoints, confidence, _note("mean likelihood of the detections used", "1")),
-        "n_views": (keypoints, seen.sum(axis=1)[..., None], _note("cameras that saw the marker", "1")),
-        "q": (("time", "dof"), result.q, _note("degrees of freedom", "see dof_unit")),
-        "dq": (("time", "dof"), result.dq, _note("first time derivative of q", "see dof_unit, per s")),
-        "ddq": (("time", "dof"), result.ddq, _note("second time derivative of q", "see dof_unit, per s^2")),
-        "detection": (pixels, result.observed, _note("detections that entered the problem", "px")),
-        "residual": (pixels, result.residuals, _note("reprojected minus detected", "px")),
-    }
-    return xr.Dataset(variables, _coordinates(result), _attributes(result))
-
-
-def _note(text: str, units: str) -> dict[str, str]:
-    return {"long_name": text, "units": units}
-
-
-def _confidence(result: FTEResult, seen: np.ndarray) -> np.ndarray:
-    """(N, M) mean likelihood of the detections that entered the problem; NaN without one."""
-    detections = result.sequence.detections.reindex(marker=result.skeleton.marker_names)
-    likelihood = detections.likelihood.transpose("frame", "camera", "marker").values
-    n_views = seen.sum(axis=1)
-    total = np.where(seen, likelihood, 0.0).sum(axis=1)
-    return np.where(n_views > 0, total / np.maximum(n_views, 1), np.nan)
-
-
-def _coordinates(result: FTEResult) -> dict[str, Any]:
-    frames = np.asarray(result.sequence.frames)
-    dofs = result.skeleton.dofs
-    return {
-        "time": ("time", frames / result.sequence.fps, _note("time from the start of the recording", "s")),
-        "frame": ("time", frames, {"long_name": "frame, counted from 0 at the start of the recording"}),
-        "space": ["x", "y", "z"],
-        "keypoints": result.skeleton.marker_names,
-        "individuals": ["id_0"],
-        "dof": result.skeleton.dof_names,
-        "dof_unit": ("dof", [dof.unit for dof in dofs]),
-        "dof_lower": ("dof", [dof.lower for dof in dofs], _note("lower limit", "see dof_unit")),
-        "dof_upper": ("dof", [dof.upper for dof in dofs], _note("upper limit", "see dof_unit")),
-        "camera": result.sequence.cameras.names,
-        "pixel": ["u", "v"],
-    }
-
-
-def _attributes(result: FTEResult) -> dict[str, Any]:
-    """Attributes that netCDF can hold: texts and numbers."""
-    from acino_fte import __version__
-
-    return {
-        "ds_type": "poses",
-        "source_software": "acino_fte",
-        "version": __version__,
-        "status": str(result.status),
-        "converged": int(result.status.ok),
-        "advice": result.status.advice,
-        "sequence": result.sequence.name,
-        "species": result.skeleton.name,
-        "method": result.method,
-        "fps": float(result.sequence.fps),
-        "time_unit": "seconds",
-        "units": "m, rad, s, px",
-        "objective": float(result.objective),
-        "iterations": int(result.iterations),
-        "options": json.dumps(json_safe(result.options)),
-    }
 
 
 def check_output_folder(out: Path | str, *, input_folder: Path | str | None = None) -> Path:
@@ -224,8 +132,8 @@ def save_result(
     Returns
     -------
     Path
-        The folder: ``fte.nc``, ``positions.csv``, ``states.csv``, ``metrics.json``, ``sequence.yaml``,
-        ``figures/``, ``report.html``.
+        The folder: ``fte.nc``, ``positions.csv``, ``states.csv`` (from a method with a skeleton),
+        ``metrics.json``, ``sequence.yaml``, ``figures/``, ``report.html``.
 
     Raises
     ------
@@ -280,7 +188,8 @@ def write_tables(result: FTEResult, folder: Path) -> None:
     encoding = {str(name): packed for name, v in dataset.data_vars.items() if v.dtype.kind == "f"}
     dataset.to_netcdf(folder / "fte.nc", engine="h5netcdf", encoding=encoding)
     _write_positions(result, folder / "positions.csv")
-    _write_states(result, folder / "states.csv")
+    if result.q.shape[1]:
+        _write_states(result, folder / "states.csv")
     text = json.dumps(result.metrics, indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
     provenance = yaml.safe_dump(
@@ -290,20 +199,30 @@ def write_tables(result: FTEResult, folder: Path) -> None:
 
 
 def _write_positions(result: FTEResult, path: Path) -> None:
-    """Columns frame, time_s, marker, x, y, z (m, world frame), one row for a marker in a frame."""
+    """One row for a marker in a frame: see :func:`positions_table`."""
+    positions_table(result).to_csv(path, index=False, float_format="%.6f")
+
+
+def positions_table(result: FTEResult) -> pd.DataFrame:
+    """Columns frame, time_s, marker, x, y, z (m, world frame); with covariance also sd_x, sd_y, sd_z (m).
+
+    A marker that has no position has a row with empty cells.
+    """
     import pandas as pd
 
     frames = np.asarray(result.sequence.frames)
     n_frames, n_markers = result.positions.shape[:2]
-    table = pd.DataFrame(
-        {
-            "frame": np.repeat(frames, n_markers),
-            "time_s": np.repeat(frames / result.sequence.fps, n_markers),
-            "marker": np.tile(result.skeleton.marker_names, n_frames),
-            **{axis: result.positions[..., i].ravel() for i, axis in enumerate("xyz")},
-        }
-    )
-    table.to_csv(path, index=False, float_format="%.6f")
+    columns = {
+        "frame": np.repeat(frames, n_markers),
+        "time_s": np.repeat(frames / result.sequence.fps, n_markers),
+        "marker": np.tile(result.skeleton.marker_names, n_frames),
+        **{axis: result.positions[..., i].ravel() for i, axis in enumerate("xyz")},
+    }
+    if result.position_covariance is not None:
+        variance = np.diagonal(result.position_covariance, axis1=-2, axis2=-1)
+        sd = np.sqrt(np.maximum(variance, 0.0))
+        columns |= {f"sd_{axis}": sd[..., i].ravel() for i, axis in enumerate("xyz")}
+    return pd.DataFrame(columns)
 
 
 def _write_states(result: FTEResult, path: Path) -> None:

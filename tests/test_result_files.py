@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 import yaml
-from synthetic_result import make_result
+from synthetic_result import make_result, triangulated, with_estimates
 
 from acino_fte import result_files
 from acino_fte.errors import InputError
@@ -186,3 +186,65 @@ def test_never_touches_the_input(tmp_path):
     with pytest.raises(InputError, match="holds the input"):
         check_output_folder(tmp_path / "data", input_folder=source)
     assert check_output_folder(tmp_path / "out", input_folder=source) == (tmp_path / "out").resolve()
+
+
+def test_uncertainty_and_parameters_are_read_back(result, tmp_path):
+    estimated = with_estimates(result)
+    out = save_result(estimated, tmp_path / "run", figures=False)
+    covariance = estimated.position_covariance
+    with xr.open_dataset(out / "fte.nc") as ds:
+        xr.testing.assert_identical(ds.load(), to_dataset(estimated))
+    assert ds.position_sd.dims == ds.position.dims
+    spine = result.skeleton.marker("spine")
+    np.testing.assert_allclose(
+        ds.position_sd.sel(keypoints="spine", space="y").values[:, 0], np.sqrt(covariance[:, spine, 1, 1])
+    )
+    np.testing.assert_array_equal(
+        ds.position_covariance.sel(keypoints="spine", space="x", space_other="z").values[:, 0],
+        covariance[:, spine, 0, 2],
+    )
+    np.testing.assert_array_equal(ds.q_sd.values, estimated.q_sd)
+    assert float(ds.time_offset.sel(camera="cam2")) == 0.0054
+    assert float(ds.time_offset_sd.sel(camera="cam2")) == 0.0004
+    assert ds.time_offset.attrs["units"] == "s"
+    for group, scale in estimated.parameters["segment_scale"].items():
+        assert float(ds.segment_scale.sel(group=group)) == scale
+    assert list(ds.extrinsics_rotation.sel(camera="cam3").values) == [0.001, -0.002, 0.0005]
+    assert list(ds.extrinsics_translation_sd.sel(camera="cam3").values) == [0.004, 0.006, 0.003]
+    assert np.isnan(ds.extrinsics_rotation.sel(camera="cam1")).all()
+    assert (
+        list(ds.marker_offset.sel(keypoints="nose").values) == estimated.parameters["marker_offset_m"]["nose"]
+    )
+    assert np.isfinite(ds.noise).all()
+    assert json.loads(ds.attrs["parameters"]) == estimated.parameters
+    assert json.loads(ds.attrs["findings"]) == list(estimated.findings)
+    table = pd.read_csv(out / "positions.csv")
+    assert list(table.columns)[-3:] == ["sd_x", "sd_y", "sd_z"]
+    np.testing.assert_allclose(
+        table[table.marker == "spine"].sd_z, np.sqrt(covariance[:, spine, 2, 2]), atol=1e-6
+    )
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["parameters"] == estimated.parameters
+    assert metrics["findings"] == list(estimated.findings)
+
+
+def test_parameters_of_any_shape(result):
+    odd = {"gravity": 9.81, "drift_s": {"a": 1.0, "b": None}, "q": {"cam1": 1.0}, "mode": {"x": "text"}}
+    ds = to_dataset(replace(result, parameters=odd))
+    assert float(ds.gravity) == 9.81
+    assert float(ds.drift.sel(drift_name="a")) == 1.0
+    assert ds.drift.attrs["units"] == "s"
+    assert ds.q.dims == ("time", "dof")
+    assert json.loads(ds.attrs["parameters"]) == odd
+
+
+def test_method_without_a_skeleton(result, tmp_path):
+    sparse = triangulated(result)
+    out = save_result(sparse, tmp_path / "run", figures=False)
+    assert not (out / "states.csv").exists()
+    with xr.open_dataset(out / "fte.nc") as ds:
+        assert "q" not in ds and "dof" not in ds.dims
+        assert 0 < np.isnan(ds.position).mean() < 0.7
+    table = pd.read_csv(out / "positions.csv")
+    np.testing.assert_array_equal(table.x.isna(), np.isnan(sparse.positions[..., 0]).ravel())
+    assert check_output_folder(out) == out
