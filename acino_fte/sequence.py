@@ -38,6 +38,11 @@ class Sequence:
     ground : tuple of float, optional
         The plane that the animal stands on, when it is known: a, b, c, d with a x + b y + c z = d in the
         world frame, m; (a, b, c) is a unit vector that points upwards.
+    truth_parameters : dict
+        What else is known of a simulated recording: true ``time_offset_s``, ``extrinsics``, ``segment_scale``
+        and ``marker_offset_m`` as :attr:`acino_fte.simulate.Simulation.parameters` has them, and ``swapped``,
+        a list of [frame, camera, [marker, …]] where left and right are exchanged, with frames counted from
+        the start of the recording. Empty when nothing is known.
     provenance : dict
         The sequence as it was understood, ready to be written as ``sequence.yaml``.
     warnings : tuple of str
@@ -51,6 +56,7 @@ class Sequence:
     cameras: CameraArray
     truth: xr.DataArray | None = None
     ground: tuple[float, float, float, float] | None = None
+    truth_parameters: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 

@@ -17,6 +17,7 @@ from acino_fte.data_tools.matching import match_markers, match_warnings
 from acino_fte.data_tools.pairing import check_pairing
 from acino_fte.data_tools.sequence_file import FILE_NAME, SequenceFile, read_sequence_file
 from acino_fte.data_tools.truth import read_truth
+from acino_fte.data_tools.truth_parameters import read_truth_parameters
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.models import species_names
 from acino_fte.sequence import Sequence
@@ -74,6 +75,9 @@ def load_sequence(
     warnings += checks.same_pose_warnings(cameras)
     warnings += check_pairing(detections, cameras, likelihood)
     truth = read_truth(file.truth, skeleton, n_frames) if file.truth else None
+    parameters = {}
+    if file.truth_parameters:
+        parameters = read_truth_parameters(file.truth_parameters, skeleton, cameras.names, n_frames)
     folder = source.parent if source.is_file() else source
     name = file.name or folder.resolve().name
     sequence = Sequence(
@@ -84,6 +88,7 @@ def load_sequence(
         cameras=cameras,
         truth=truth,
         ground=file.ground.plane if file.ground else None,
+        truth_parameters=parameters,
         provenance={**file.to_dict(), "name": name},
         warnings=tuple(warnings),
     )

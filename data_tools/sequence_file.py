@@ -54,6 +54,9 @@ class SequenceFile(BaseModel):
     )
     frames: tuple[int, int] | None = Field(None, description="start and stop, half-open, counted from 0")
     truth: str | None = Field(None, description="CSV with frame, marker, x, y, z (m) where they are known")
+    truth_parameters: str | None = Field(
+        None, description="JSON with true time offsets, camera poses, proportions and swaps (simulations)"
+    )
     ground: Ground | None = Field(None, description="the plane that the animal stands on")
 
     @field_validator("keypoints", mode="before")
@@ -93,6 +96,9 @@ class SequenceFile(BaseModel):
             "cameras": absolute(self.cameras),
             "keypoints": {name: absolute(path) for name, path in self.keypoints.items()},
             "truth": absolute(self.truth) if self.truth is not None else None,
+            "truth_parameters": absolute(self.truth_parameters)
+            if self.truth_parameters is not None
+            else None,
         }
         return self.model_copy(update=update)
 
