@@ -13,7 +13,7 @@ from rich.markup import escape
 from acino_fte.cli_common import reported_errors, stdout, warn
 
 if TYPE_CHECKING:
-    from acino_fte.simulate import SimulationOptions
+    from acino_fte.simulation_options import SimulationOptions
 
 
 class _CameraModel(StrEnum):
@@ -28,7 +28,7 @@ class _Layout(StrEnum):
 
 
 _Fraction = {"min": 0.0, "max": 1.0}
-_MOVE, _VIEW, _FAULT = "Motion", "Cameras", "Detector"
+_MOVE, _VIEW, _FAULT, _FLAW = "Motion", "Cameras", "Detector", "Imperfections, to be estimated"
 
 
 def simulate(
@@ -40,7 +40,8 @@ def simulate(
     motion: Annotated[
         str,
         typer.Option(
-            help="gallop, flick, turn (cheetah), walk (human) or wander (any species).",
+            help="gallop, flick, turn (cheetah), walk (human), wander or prior (any species). 'prior' draws "
+            "from the prior that 'acino-fte run' estimates with.",
             rich_help_panel=_MOVE,
         ),
     ] = "gallop",
@@ -54,6 +55,20 @@ def simulate(
             rich_help_panel=_MOVE,
         ),
     ] = None,
+    noise_scale: Annotated[
+        float,
+        typer.Option(
+            min=1e-6, help="Process noise of the motion 'prior', as in 'run'.", rich_help_panel=_MOVE
+        ),
+    ] = 1.0,
+    prior_width: Annotated[
+        float,
+        typer.Option(
+            min=1e-6,
+            help="Width of the motion 'prior', in half ranges, as in 'run'; 0.25 stays inside the ranges.",
+            rich_help_panel=_MOVE,
+        ),
+    ] = 0.25,
     cameras: Annotated[int, typer.Option(min=1, help="Number of cameras.", rich_help_panel=_VIEW)] = 6,
     layout: Annotated[
         _Layout,
@@ -110,6 +125,48 @@ def simulate(
         bool,
         typer.Option("--quantise", help="Round to DeepLabCut's grid, 8 k + 4 px.", rich_help_panel=_FAULT),
     ] = False,
+    delay_ms: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1e4,
+            help="Cameras but the first are triggered late or early, by at most this, ms.",
+            rich_help_panel=_FLAW,
+        ),
+    ] = 0.0,
+    moved_mm: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1e5,
+            help="Cameras but the first have moved since calibration: standard deviation per axis, mm.",
+            rich_help_panel=_FLAW,
+        ),
+    ] = 0.0,
+    moved_deg: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=45.0, help="The same of their turns, per axis, degrees.", rich_help_panel=_FLAW
+        ),
+    ] = 0.0,
+    proportions: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="Standard deviation of the logarithm of each segment group's length; 0.05 is about 5 %.",
+            rich_help_panel=_FLAW,
+        ),
+    ] = 0.0,
+    offsets_mm: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1e3,
+            help="Markers are found beside their place on the link: standard deviation per axis, mm.",
+            rich_help_panel=_FLAW,
+        ),
+    ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same recording.")] = 0,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier simulation in OUT.")
@@ -119,9 +176,9 @@ def simulate(
 
     Writes a sequence folder that 'acino-fte run' reads: detections, calibration, truth.
     """
-    from acino_fte.simulate import SimulationOptions
     from acino_fte.simulate import simulate as run_simulation
     from acino_fte.simulation_files import check_target, write_simulation
+    from acino_fte.simulation_options import SimulationOptions
     from acino_fte.skeleton import load_skeleton
 
     with reported_errors():
@@ -142,6 +199,13 @@ def simulate(
             swaps=swaps,
             occlusion=occlusion,
             quantise=quantise,
+            delay_ms=delay_ms,
+            moved_mm=moved_mm,
+            moved_deg=moved_deg,
+            proportions=proportions,
+            offsets_mm=offsets_mm,
+            noise_scale=noise_scale,
+            prior_width=prior_width,
             seed=seed,
         )
         simulation = run_simulation(load_skeleton(species), options)

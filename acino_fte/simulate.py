@@ -9,119 +9,26 @@ Shapes: N frames, C cameras, M markers, Q degrees of freedom.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acino_fte.camera_ring import CameraModel, Layout, camera_ring, default_radius
+from acino_fte.camera_ring import camera_ring, default_radius
 from acino_fte.cameras import CameraArray
 from acino_fte.detector import Detections, Faults, detect
-from acino_fte.errors import InputError
+from acino_fte.imperfections import Imperfections, draw_imperfections
 from acino_fte.kinematics import load_kinematics
-from acino_fte.motions import find_recipe, make_motion
+from acino_fte.motions import find_recipe, make_motion, plan_motion
 from acino_fte.occlusion import hidden_by_body
+from acino_fte.prior_motion import prior_motion
+from acino_fte.simulation_options import PRIOR_MOTION, SimulationOptions
 from acino_fte.skeleton import Skeleton
 
 if TYPE_CHECKING:
     from acino_fte.sequence import Sequence
 
 _PATH = 3.0  # longest path, in distances of the cameras
-
-
-@dataclass(frozen=True)
-class SimulationOptions:
-    """Everything that decides a simulated recording. The same options give the same recording.
-
-    Attributes
-    ----------
-    motion : str
-        One of :func:`acino_fte.motions.motion_names`; ``"wander"`` fits every species.
-    n_frames, fps : int, float
-        Length and frame rate (Hz).
-    n_cameras : int
-    camera_model : str
-        ``"fisheye"`` (the action cameras of AcinoSet) or ``"pinhole"``.
-    layout : str
-        ``"sides"`` (along both sides of the path), ``"ring"`` (about it) or ``"auto"`` (a ring for a path
-        shorter than the distance of the cameras).
-    radius, height : float, optional
-        Of the cameras, m; by default in proportion to the animal.
-    longest_path : float, optional
-        Metres; a longer run is simulated as on a treadmill, so that a fixed set of cameras sees all of
-        it. By default three times the distance of the cameras (22 m for a cheetah); infinity for none.
-    noise_px : float or "species"
-        Standard deviation of u and of v, px; ``"species"`` takes each marker's ``sd_px``.
-    missing : float
-        Fraction of the markers in an image that are not detected (dropouts, at random): NaN.
-    outliers : float
-        Fraction of the remaining detections that are gross errors: half on another marker, half anywhere
-        in a box about the animal.
-    swaps : float
-        Fraction of the images (per frame and camera) in which left and right are exchanged: of the whole
-        animal in half of them, of one limb in the others.
-    occlusion : bool
-        Markers hidden by the body (its capsules) get a guessed place and mostly a low likelihood.
-    occlusion_px : float
-        Standard deviation of such a guess, px.
-    quantise : bool
-        Round to DeepLabCut's grid: 8 k + 4 px.
-    seed : int
-        Of all random streams. Every fault has its own, so that switching one off leaves the others as
-        they were.
-    """
-
-    motion: str = "gallop"
-    n_frames: int = 120
-    fps: float = 120.0
-    n_cameras: int = 6
-    camera_model: CameraModel = "fisheye"
-    layout: Layout = "auto"
-    radius: float | None = None
-    height: float | None = None
-    longest_path: float | None = None
-    noise_px: float | Literal["species"] = 2.0
-    missing: float = 0.1
-    outliers: float = 0.02
-    swaps: float = 0.0
-    occlusion: bool = True
-    occlusion_px: float = 15.0
-    quantise: bool = False
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for key in ("missing", "outliers", "swaps"):
-            _check(self, key, 0.0, 1.0, "a fraction from 0 to 1")
-        _check(self, "n_frames", 1, 1_000_000, "at least 1")
-        _check(self, "n_cameras", 1, 1000, "at least 1")
-        _check(self, "fps", 1e-3, 1e6, "frames per second, above 0")
-        _check(self, "seed", 0, 2**63, "a whole number from 0")
-        _check(self, "occlusion_px", 0.0, 1e4, "px, at least 0")
-        for key in ("radius", "longest_path"):
-            if getattr(self, key) is not None:
-                _check(self, key, 1e-6, math.inf, "metres, above 0")
-        if self.height is not None:
-            _check(self, "height", -1e6, 1e6, "metres")
-        if self.noise_px != "species":
-            _check(self, "noise_px", 0.0, 1e4, "px, at least 0, or 'species'")
-        for key, known in (("camera_model", ("fisheye", "pinhole")), ("layout", ("auto", "sides", "ring"))):
-            if getattr(self, key) not in known:
-                raise InputError(
-                    f"The simulation option '{key}' is wrong.",
-                    key=key,
-                    expected=" or ".join(f"'{k}'" for k in known),
-                    found=repr(getattr(self, key)),
-                )
-
-
-def _check(options: SimulationOptions, key: str, lower: float, upper: float, expected: str) -> None:
-    value = getattr(options, key)
-    whole = next(f.type for f in fields(options) if f.name == key) == "int"
-    right = isinstance(value, (int, np.integer) if whole else (int, float, np.number))
-    if isinstance(value, bool) or not right or not lower <= value <= upper:
-        raise InputError(
-            f"The simulation option '{key}' is wrong.", key=key, expected=expected, found=repr(value)
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,12 +42,21 @@ class Simulation:
     q : (N, Q)
         True degrees of freedom, rad and m.
     positions : (N, M, 3)
-        True marker positions, m, world frame; the ground is z = 0.
+        True positions at the frames of the points that the detector looks for, m, world frame; the ground
+        is z = 0.
     cameras : CameraArray
+        The calibration as it is given to the user.
     pixels : (N, C, M, 2)
-        True projections, px; NaN behind a camera.
+        True projections, px, at the moments that each camera saw; NaN behind a camera.
     detections : Detections
         What the detector made of them.
+    true_cameras : CameraArray
+        Where the cameras really were.
+    parameters : dict
+        What else was not as it should be: ``time_offset_s`` of the cameras (s); ``extrinsics`` (the
+        correction ``rotation_rad``, ``translation_m`` of each given camera, x_camera =
+        Exp(rotation)·(R x + t) + translation); ``segment_scale`` of the segment groups;
+        ``marker_offset_m`` (in the link's frame). Complete: zeros and ones where nothing is wrong.
     """
 
     skeleton: Skeleton
@@ -150,14 +66,28 @@ class Simulation:
     cameras: CameraArray
     pixels: np.ndarray
     detections: Detections
+    true_cameras: CameraArray
+    parameters: dict[str, Any]
+
+    @property
+    def swapped(self) -> list[list[Any]]:
+        """[frame, camera, [marker, …]] wherever detections took the places of their twins."""
+        camera, marker = self.cameras.names, self.skeleton.marker_names
+        return [
+            [int(n), camera[c], [marker[m] for m in np.flatnonzero(self.detections.swapped[n, c])]]
+            for n, c in np.argwhere(self.detections.swapped.any(axis=2))
+        ]
+
+    @property
+    def truth_parameters(self) -> dict[str, Any]:
+        """``parameters`` and, as ``swapped``, the left/right swaps: all plain values."""
+        return {**self.parameters, "swapped": self.swapped}
 
     @property
     def notes(self) -> list[str]:
         """What the user should know about the recording, one sentence each."""
         options, notes = self.options, []
-        recipe = find_recipe(self.skeleton, options.motion, options.seed)
-        path = recipe.speed * options.n_frames / options.fps
-        longest = _longest_path(self.skeleton, options)
+        path, longest = _path_length(self.skeleton, options), _longest_path(self.skeleton, options)
         if path > longest:
             notes.append(
                 f"the path would be {path:.0f} m long; the animal moves as on a treadmill over "
@@ -192,45 +122,84 @@ def simulate(skeleton: Skeleton, options: SimulationOptions | None = None) -> Si
         There is no such motion, or it does not fit the species.
     """
     options = options or SimulationOptions()
-    kinematics = load_kinematics(skeleton)
-    q = _motion(skeleton, options)
-    positions = kinematics.positions(q)
+    flaws = draw_imperfections(skeleton, options)
+    q, seen = _states(skeleton, options, flaws)
+    likeness = _states(skeleton, options)[0] if options.proportions else q
     cameras = camera_ring(
-        positions,
+        load_kinematics(skeleton).positions(likeness),  # the species: proportions do not move the cameras
         options.n_cameras,
         radius=options.radius,
         height=options.height,
         model=options.camera_model,
         layout=options.layout,
     )
-    pixels = cameras.project(positions)
+    kinematics, parameters = flaws.animal(skeleton)
+    positions = kinematics.positions(q, parameters)
+    views = [positions if s is q else kinematics.positions(s, parameters) for s in seen]
+    pixels = np.stack([camera.project(view) for camera, view in zip(cameras, views, strict=True)], axis=1)
     in_image = np.stack([camera.inside(pixels[:, c]) for c, camera in enumerate(cameras)], axis=1)
+    hidden = np.zeros(in_image.shape, dtype=bool)
     if options.occlusion:
-        hidden = hidden_by_body(skeleton, positions, cameras)
-    else:
-        hidden = np.zeros(in_image.shape, dtype=bool)
+        for c, view in enumerate(views):
+            hidden[:, c] = hidden_by_body(skeleton, view, CameraArray((cameras[c],)))[:, 0]
     resolution = np.array([camera.resolution for camera in cameras], dtype=float)
     detections = detect(skeleton, pixels, in_image, hidden, resolution, _faults(skeleton, options))
-    return Simulation(skeleton, options, q, positions, cameras, pixels, detections)
+    return Simulation(
+        skeleton,
+        options,
+        q,
+        positions,
+        flaws.given_cameras(cameras),
+        pixels,
+        detections,
+        cameras,
+        flaws.parameters(skeleton, cameras.names),
+    )
 
 
-def _motion(skeleton: Skeleton, options: SimulationOptions) -> np.ndarray:
-    """Degrees of freedom (N, Q), on a treadmill where the path would be too long."""
-    return make_motion(
-        load_kinematics(skeleton),
+def _states(
+    skeleton: Skeleton, options: SimulationOptions, flaws: Imperfections | None = None
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Degrees of freedom (N, Q): at the frames, and for each camera at the moments that it sees."""
+    if options.motion == PRIOR_MOTION:
+        q = prior_motion(
+            skeleton,
+            options.n_frames,
+            options.fps,
+            seed=options.seed,
+            noise_scale=options.noise_scale,
+            prior_width=options.prior_width,
+        )
+        return q, [q] * options.n_cameras
+    kinematics, parameters = flaws.body(skeleton) if flaws else (load_kinematics(skeleton), None)
+    motion = plan_motion(
+        kinematics,
         options.motion,
         options.n_frames,
         options.fps,
         seed=options.seed,
         longest_path=_longest_path(skeleton, options),
+        parameters=parameters,
     )
+    q = motion.at_frames
+    return q, [motion(motion.time + delay) if delay else q for delay in flaws.delay] if flaws else []
+
+
+def _path_length(skeleton: Skeleton, options: SimulationOptions) -> float:
+    """How far the motion would travel, m."""
+    if options.motion == PRIOR_MOTION:
+        return 0.0
+    return find_recipe(skeleton, options.motion, options.seed).speed * options.n_frames / options.fps
 
 
 def _longest_path(skeleton: Skeleton, options: SimulationOptions) -> float:
+    """How far it may travel, m, before it moves as on a treadmill."""
     if options.longest_path is not None:
         return options.longest_path
     if options.radius is not None:
         return _PATH * options.radius
+    if options.motion == PRIOR_MOTION:
+        return math.inf
     kinematics = load_kinematics(skeleton)
     pose = make_motion(kinematics, options.motion, 1, options.fps, seed=options.seed)
     return _PATH * default_radius(kinematics.positions(pose))
@@ -299,4 +268,5 @@ def simulation_to_sequence(simulation: Simulation, name: str | None = None) -> S
         detections=detections,
         cameras=simulation.cameras,
         truth=truth,
+        truth_parameters=simulation.truth_parameters,
     )

@@ -33,6 +33,10 @@ which makes it again, number for number. All options are in `simulation.json`.
 | `truth.csv` | true marker positions, m, world frame, z up, ground at z = 0 |
 | `truth_states.csv` | true degrees of freedom, rad and m |
 """
+_README_PARAMETERS = (
+    "| `truth_parameters.json` | true time offsets of the cameras, corrections of `cameras.json`, "
+    "proportions of the animal, displacements of the markers, and left/right swaps |\n"
+)
 
 
 def write_simulation(
@@ -128,6 +132,7 @@ def _write_files(simulation: Simulation, folder: Path, name: str, command: str) 
     from acino_fte.data_tools.deeplabcut import write_deeplabcut_csv
     from acino_fte.data_tools.sequence_file import write_sequence_file
     from acino_fte.data_tools.truth import write_truth
+    from acino_fte.data_tools.truth_parameters import FILE_NAME, write_truth_parameters
 
     skeleton, options, detections = simulation.skeleton, simulation.options, simulation.detections
     write_cameras(folder / "cameras.json", simulation.cameras)
@@ -142,6 +147,12 @@ def _write_files(simulation: Simulation, folder: Path, name: str, command: str) 
         )
     write_truth(folder / "truth.csv", skeleton.marker_names, simulation.positions)
     _write_states(simulation, folder / "truth_states.csv")
+    truths = {"truth": "truth.csv"}
+    text = _README.format(name=name, species=skeleton.name, command=command, **asdict(options))
+    if options.has_imperfections:
+        write_truth_parameters(folder / FILE_NAME, simulation.truth_parameters)
+        truths["truth_parameters"] = FILE_NAME
+        text += _README_PARAMETERS
     write_sequence_file(
         folder / "sequence.yaml",
         {
@@ -151,10 +162,9 @@ def _write_files(simulation: Simulation, folder: Path, name: str, command: str) 
             "fps": float(options.fps),
             "cameras": "cameras.json",
             "keypoints": {camera: f"dlc/{camera}.csv" for camera in simulation.cameras.names},
-            "truth": "truth.csv",
+            **truths,
         },
     )
-    text = _README.format(name=name, species=skeleton.name, command=command, **asdict(options))
     (folder / "README.md").write_text(text, encoding="utf-8")
     _write_provenance(simulation, folder / PROVENANCE, command)
 

@@ -213,6 +213,36 @@ def test_command_writes_a_sequence(run, tmp_path):
         assert flag in recorded
 
 
+IMPERFECT = "--delay-ms 4 --moved-mm 20 --moved-deg 0.5 --proportions 0.05 --offsets-mm 10"
+
+
+def test_command_writes_imperfections_and_how_to_make_them_again(run, tmp_path):
+    result = run(tmp_path / "a", *f"--frames 8 --swaps 0.4 --seed 3 {IMPERFECT}".split())
+    assert result.exit_code == 0, result.output
+    recorded = json.loads((tmp_path / "a" / "simulation.json").read_text())["command"]
+    assert IMPERFECT in recorded
+    again = run(tmp_path / "b", *shlex.split(recorded)[3:])
+    assert again.exit_code == 0, again.output
+    first, second = (load_sequence(tmp_path / name) for name in "ab")
+    assert first.truth_parameters == second.truth_parameters
+    assert first.detections.equals(second.detections)
+    assert len(first.truth_parameters["swapped"]) > 5
+
+
+def test_command_draws_from_the_prior(run, tmp_path):
+    flags = "--motion prior --frames 8 --noise-scale 0.5 --prior-width 0.2"
+    result = run(tmp_path / "a", *flags.split())
+    assert result.exit_code == 0, result.output
+    options = json.loads((tmp_path / "a" / "simulation.json").read_text())["options"]
+    assert (options["motion"], options["noise_scale"], options["prior_width"]) == ("prior", 0.5, 0.2)
+
+
+def test_help_lists_the_imperfections(run):
+    shown = run("--help").output
+    for flag in [*IMPERFECT.split()[::2], "--noise-scale", "--prior-width"]:
+        assert flag in shown
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -223,6 +253,15 @@ def test_command_writes_a_sequence(run, tmp_path):
         ("--missing 2", "missing"),
         ("--frames 0", "frames"),
         ("--camera-model omni", "camera-model"),
+        ("--delay-ms -1", "delay-ms"),
+        ("--delay-ms nan", "delay-ms"),
+        ("--delay-ms 2 --motion prior", "no camera can be late"),
+        ("--moved-mm far", "moved-mm"),
+        ("--moved-deg 90", "moved-deg"),
+        ("--proportions 3", "proportions"),
+        ("--offsets-mm -5", "offsets-mm"),
+        ("--noise-scale 0", "noise-scale"),
+        ("--prior-width 0", "prior-width"),
     ],
 )
 def test_wrong_arguments_leave_with_2_and_a_message(run, tmp_path, arguments, message):
