@@ -1,8 +1,9 @@
-"""The methods beside full trajectory estimation: one function for all baselines.
+"""All methods behind one function: full trajectory estimation, and the baselines it is held against.
 
 ===========  =============================================  =========================================
 method       what it does                                   where
 ===========  =============================================  =========================================
+fte          full trajectory estimation                     :mod:`acino_fte.estimate`
 tri          triangulates every marker in every frame       :mod:`acino_fte.baseline_tri`
 sba          adjusts those points, and cameras if asked     :mod:`acino_fte.baseline_sba`
 ekf          Kalman filter and smoother on the skeleton     :mod:`acino_fte.baseline_ekf`
@@ -12,27 +13,30 @@ ekf          Kalman filter and smoother on the skeleton     :mod:`acino_fte.base
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.kinematics import Kinematics
-from acino_fte.problem import FTEOptions
 from acino_fte.result import FTEResult
 from acino_fte.sequence import Sequence
 
+if TYPE_CHECKING:
+    from acino_fte.estimate import EstimateOptions
+
 BASELINES = ("tri", "sba", "ekf")
+METHODS = ("fte", *BASELINES)
 
 
 def estimate(
     method: str,
     sequence: Sequence,
     kinematics: Kinematics,
-    options: FTEOptions | None = None,
+    options: EstimateOptions | None = None,
     *,
-    cameras_too: bool = False,
     progress: Callable[[int, float], None] | None = None,
     seconds: dict[str, float] | None = None,
 ) -> FTEResult:
-    """Estimate a trajectory by one of :data:`BASELINES`.
+    """Estimate a trajectory by one of :data:`METHODS`.
 
     Parameters
     ----------
@@ -42,11 +46,10 @@ def estimate(
         With detections of the skeleton's markers.
     kinematics : Kinematics
         ``tri`` and ``sba`` use no more of it than the markers and their ``sd_px``.
-    options : FTEOptions, optional
-        The likelihood threshold counts for all; the loss for the cost of ``tri`` and ``sba``; the process
-        noise and the joints' prior for ``ekf``; the widths of the extrinsics' prior for ``cameras_too``.
-    cameras_too : bool
-        ``sba`` corrects the poses of the cameras as well.
+    options : EstimateOptions, optional
+        Of the baselines, only ``sba`` estimates parameters: the corrections of the cameras, when ``fit``
+        names ``extrinsics``. All use the options of the problem: the likelihood threshold; the loss for
+        the cost of ``tri`` and ``sba``; the process noise and the joints' prior for ``ekf``.
     progress : callable, optional
         Called with (iteration, objective); never by ``tri``.
     seconds : dict, optional
@@ -55,33 +58,34 @@ def estimate(
     Raises
     ------
     InputError
-        There is no such method, it cannot correct cameras, or the detections do not suffice.
+        There is no such method, or the detections do not suffice.
     """
-    if method not in BASELINES:
+    from acino_fte.estimate import EstimateOptions, estimate_fte
+
+    chosen = options or EstimateOptions()
+    if method not in METHODS:
         raise InputError(
-            f"There is no baseline '{method}'{did_you_mean(method, BASELINES)}",
+            f"There is no method '{method}'{did_you_mean(method, METHODS)}",
             key="method",
-            expected=f"one of {', '.join(BASELINES)}",
+            expected=f"one of {', '.join(METHODS)}",
         )
-    if cameras_too and method != "sba":
-        raise InputError(
-            f"The method '{method}' does not correct cameras.", key="cameras_too", remedy="use 'sba' for it"
-        )
+    if method == "fte":
+        return estimate_fte(sequence, kinematics, chosen, progress=progress, seconds=seconds)
     if method == "tri":
         from acino_fte.baseline_tri import estimate_tri
 
-        return estimate_tri(sequence, kinematics.skeleton, options, seconds=seconds)
+        return estimate_tri(sequence, kinematics.skeleton, chosen.problem, seconds=seconds)
     if method == "sba":
         from acino_fte.baseline_sba import estimate_sba
 
         return estimate_sba(
             sequence,
             kinematics.skeleton,
-            options,
-            cameras_too=cameras_too,
+            chosen.problem,
+            cameras_too="extrinsics" in (chosen.fit or ()),
             progress=progress,
             seconds=seconds,
         )
     from acino_fte.baseline_ekf import estimate_ekf
 
-    return estimate_ekf(sequence, kinematics, options, progress=progress, seconds=seconds)
+    return estimate_ekf(sequence, kinematics, chosen.problem, progress=progress, seconds=seconds)

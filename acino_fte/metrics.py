@@ -85,6 +85,7 @@ def result_metrics(result: FTEResult) -> dict[str, Any]:
         "parameter_errors": parameter_errors(result) or None,
     }
     metrics |= {name: value for name, value in optional.items() if value is not None}
+    metrics |= result.evaluation
     return json_safe(metrics)
 
 

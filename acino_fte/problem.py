@@ -52,7 +52,7 @@ class FTEOptions:
     """
 
     likelihood: float = 0.5
-    loss: Loss = field(default_factory=Loss)
+    loss: Loss = field(default_factory=lambda: Loss("geman_mcclure"))
     noise_scale: float = 1.0
     prior_width: float = 2.0
     fit: tuple[str, ...] = ()

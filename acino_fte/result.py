@@ -91,6 +91,8 @@ class FTEResult:
     findings : tuple of str
         What the estimate noticed about the recording: swapped sides, cameras that moved or are out of
         step, parameters that could not be observed. One sentence each.
+    evaluation : dict
+        Fields for ``metrics.json`` from an evaluation on cameras left out (:mod:`acino_fte.holdout`).
     """
 
     status: Status
@@ -111,6 +113,7 @@ class FTEResult:
     q_sd: np.ndarray | None = None
     position_covariance: np.ndarray | None = None
     findings: tuple[str, ...] = ()
+    evaluation: dict[str, Any] = field(default_factory=dict)
 
     @cached_property
     def residuals(self) -> np.ndarray:

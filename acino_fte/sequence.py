@@ -109,6 +109,13 @@ class Sequence:
         sure = chosen.candidate_likelihood.transpose(*dims).values > likelihood
         return np.where(sure[..., None] & np.isfinite(position).all(-1, keepdims=True), position, np.nan)
 
+    def candidate_likelihood(self, markers: list[str]) -> np.ndarray | None:
+        """Likelihoods (N, C, M, K) of the candidates of the given markers; None when there are none."""
+        if "candidate_likelihood" not in self.detections:
+            return None
+        chosen = self.detections.reindex(marker=markers).candidate_likelihood
+        return chosen.transpose("frame", "camera", "marker", "candidate").values
+
     def select_frames(self, start: int | None, stop: int | None) -> Sequence:
         """Frames start ≤ frame < stop, numbered from the start of the recording.
 

@@ -14,6 +14,8 @@ import numpy as np
 
 from acino_fte.condensed import Condensed
 from acino_fte.errors import InputError
+from acino_fte.parameters import describe
+from acino_fte.prediction import corrected_cameras, predict, time_offsets
 from acino_fte.problem import FTEProblem
 from acino_fte.result import FTEResult, Status
 
@@ -135,6 +137,7 @@ class _Callbacks:
         self.iterations = 0
         self.best = (np.inf, np.empty(0))
         self._last = np.inf
+        self._slow = 0
 
     def objective(self, x: np.ndarray) -> float:
         """Value, remembered when it is the best so far."""
@@ -162,9 +165,10 @@ class _Callbacks:
             self.progress(iteration, value)
         gain = (self._last - value) / abs(value) if value else 0.0
         self._last = value
+        self._slow = self._slow + 1 if 0 <= gain < self.enough else 0
         if self.refine and iteration >= _PATIENCE and 0 <= gain < _NEAR:
             self.condensed.use_exact()
-        return not (self.stop or 0 <= gain < self.enough)
+        return not (self.stop or self._slow >= _SLOW)
 
 
 def minimise(
@@ -178,8 +182,8 @@ def minimise(
     """Minimise a problem from q (N, Q) and θ (P,), zero when left out, by its condensed lowering.
 
     Ctrl-C ends it with the best iterate so far and the status ``interrupted``. ``enough`` stops it early
-    once an iteration lowers the objective by less than this fraction: for a start, not for a result, so
-    that Ctrl-C then raises KeyboardInterrupt.
+    once two iterations in a row lower the objective by less than this fraction: for a start, not for a
+    result, so that Ctrl-C then raises KeyboardInterrupt.
     """
     import cyipopt
 
@@ -227,6 +231,7 @@ def check_linear_solver(status: Status, iterations: int, options: SolveOptions) 
 # Relative decrease per iteration below which the exact Hessian takes over. Residuals are large where the
 # skeleton does not fit the animal, and Gauss–Newton steps then only crawl to the minimum.
 _NEAR = 1e-5
+_SLOW = 2  # iterations in a row with little gain: the first ones may be short while the barrier settles
 _PATIENCE = 8  # iterations: where the skeleton fits, Gauss–Newton is done by then
 
 _STRATEGY: dict[str, str | float | int] = {
@@ -302,26 +307,35 @@ def solve_fte(
         raise InputError(
             f"There is no lowering '{lowering}'.", key="lowering", expected="'condensed' or 'explicit'"
         )
-    positions = problem.kinematics.positions(minimum.q)
-    velocity = _rate(minimum.q, problem.dt)
+    positions = problem.kinematics.positions(minimum.q, problem.proportions(minimum.theta))
+    velocity, acceleration = rates(minimum.q, problem.dt)
+    cameras = corrected_cameras(problem.sequence.cameras, problem.parameters, minimum.theta)
+    late = time_offsets(cameras, problem.parameters, minimum.theta)
     return FTEResult(
         status=minimum.status,
         sequence=problem.sequence,
         skeleton=problem.kinematics.skeleton,
         q=minimum.q,
         dq=velocity,
-        ddq=_rate(velocity, problem.dt),
+        ddq=acceleration,
         positions=positions,
         observed=problem.sequence.pixels(
             problem.kinematics.skeleton.marker_names, problem.options.likelihood
         ),
-        reprojected=problem.sequence.cameras.project(positions),
+        reprojected=predict(cameras, positions, late, problem.dt),
         objective=minimum.objective,
         iterations=minimum.iterations,
         method=f"fte-{lowering}",
         seconds={**(seconds or {}), "solve": time.perf_counter() - began},
         options={"problem": problem.options.summary(), "solver": options.summary()},
+        parameters=describe(problem.parameters, minimum.theta, None),
     )
+
+
+def rates(q: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """First and second backward differences in time of q (N, Q)."""
+    velocity = _rate(q, dt)
+    return velocity, _rate(velocity, dt)
 
 
 def _rate(values: np.ndarray, dt: float) -> np.ndarray:
