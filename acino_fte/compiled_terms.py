@@ -18,7 +18,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from acino_fte import delay
-from acino_fte.residuals import lower, width
+from acino_fte.errors import InputError
+from acino_fte.residuals import Residual, lower, width
 from acino_fte.terms import Term
 
 _CHUNK = 2048  # instances evaluated together: a program's intermediate rows stay in the cache
@@ -106,10 +107,16 @@ class CompiledTerm:
 
     Velocities and accelerations of the first frames are free: the jumps of acceleration that need frames
     before the first are made zero by them (see :mod:`acino_fte.explicit`) and leave the problem with them.
+
+    Raises
+    ------
+    InputError
+        A delayed position stands in a residual beside another position or a degree of freedom.
     """
 
     def __init__(self, term: Term, dt: float, n_frames: int, n_markers: int) -> None:
         lowered = lower(term.residual)
+        _check_delay(term.residual)
         term = term.select(term.frames >= term.residual.reach)
         self.term, self.lowered, self.dt = term, lowered, dt
         self.n_components = len(term.residual.components)
@@ -234,18 +241,18 @@ class CompiledTerm:
         n = self.n_local
         bent = np.where(np.isfinite(found.second), (psi / self.sd)[:, None] * found.second, 0.0).sum(0)
         own = np.empty((n, n, self.size))
-        for place, (i, j) in enumerate(zip(*np.tril_indices(n), strict=True)):
-            own[i, j] = own[j, i] = bent[place]
+        rows, columns = np.tril_indices(n)
+        own[rows, columns] = own[columns, rows] = bent
         local[:n, :n] += own
         carried = {
             row: np.einsum("iak,ak->ik", own[:, self.slots[i].rows], blend.velocity)
             for row, (i, blend) in enumerate(found.blends.items(), start=n)
         }
-        for row, column in carried.items():
-            local[:n, row] += column
-            local[row, :n] += column
-            for other, (i, blend) in enumerate(found.blends.items(), start=n):
-                local[other, row] += (column[self.slots[i].rows] * blend.velocity).sum(0)
+        for column, values in carried.items():
+            local[:n, column] += values
+            local[column, :n] += values
+            for row, (i, blend) in enumerate(found.blends.items(), start=n):
+                local[row, column] += (values[self.slots[i].rows] * blend.velocity).sum(0)
 
     def mixed(self, found: Evaluation, slot: Slot, pull: np.ndarray) -> np.ndarray | None:
         """∂w_k/∂τ ∂E/∂p̃ of a delayed position, (nodes, 3, K); None of any other."""
@@ -257,6 +264,17 @@ class CompiledTerm:
         if node.place is None:
             return 1.0
         return found.blends[self.slots.index(slot)].weights[node.place]
+
+
+def _check_delay(residual: Residual) -> None:
+    """At both ends the frames of a stencil depend on the instance: nothing else with a frame goes with it."""
+    others = [h for h in residual.handles if h.kind != "parameter"]
+    if len(others) > 1 and any(h.delay is not None for h in others):
+        raise InputError(
+            f"The residual '{residual.name}' has a delayed position beside other positions or joints.",
+            expected="a delayed position, and parameters, alone",
+            found=", ".join(h.kind + (" (delayed)" if h.delay is not None else "") for h in others),
+        )
 
 
 def _nodes(

@@ -94,9 +94,10 @@ class _Point:
                 inputs.append(self.theta[term.items[:, handle.item]])
                 continue
             if handle.delay is not None:
-                newest = delay.stencil(term.frames, problem.n_frames)
+                frames = term.frames - handle.lag
+                newest = delay.stencil(frames, problem.n_frames)
                 late = self.theta[term.items[:, handle.delay]] / problem.dt
-                weights = delay.weights(late - (newest - term.frames))[0]
+                weights = delay.weights(late - (newest - frames))[0]
                 nodes = self.position[newest - np.arange(delay.NODES)[:, None], term.items[:, handle.item]]
                 inputs += list(np.einsum("nk,nka->ak", weights, nodes))
                 continue
@@ -231,7 +232,7 @@ def _instances(
         inputs: list[Any] = []
         for handle in term.residual.handles:
             if handle.delay is not None:
-                inputs += _delayed(model, problem, n, items, handle)
+                inputs += _delayed(model, problem, n - handle.lag, items, handle)
             else:
                 inputs += _handle_values(model, handle, frames[n - handle.lag], int(items[handle.item]))
         data = [term.data[name] for name in term.residual.data]
@@ -244,7 +245,7 @@ def _instances(
 def _delayed(
     model: pyo.ConcreteModel, problem: FTEProblem, n: int, items: np.ndarray, handle: Handle
 ) -> list[Any]:
-    """A marker's position at t + τ (:mod:`acino_fte.delay`), one expression for each camera, marker, frame."""
+    """A marker's position at t + τ (:mod:`acino_fte.delay`): an expression a camera, marker and frame."""
     newest = int(delay.stencil(np.array(n), problem.n_frames))
     late = model.PARAMETERS.at(int(items[handle.delay]) + 1)
     marker, frame = model.MARKERS.at(int(items[handle.item]) + 1), model.FRAMES.at(n + 1)

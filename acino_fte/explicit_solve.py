@@ -46,7 +46,7 @@ def minimise_explicit(
     route: str | None = None,
     theta: np.ndarray | None = None,
 ) -> Minimum:
-    """Build the explicit model at q (N, Q) and θ (P,) and solve it; ``route`` overrides the choice of solver."""
+    """Build the explicit model at q (N, Q) and θ (P,) and solve it; ``route`` overrides the solver."""
     model = build_explicit(problem, start, theta)
     return solve_explicit(model, problem, options, progress, route)
 

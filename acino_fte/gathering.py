@@ -1,7 +1,7 @@
-"""From derivatives of single residuals to those of the whole problem: gather, then carry through kinematics.
+"""From derivatives of single residuals to those of the whole: gather, then carry through the kinematics.
 
-Shapes: N frames, M markers, Q degrees of freedom, P parameters of which the first K are kinematic (G log-scales,
-then three offsets a marker).
+Shapes: N frames, M markers, Q degrees of freedom, P parameters of which the first K are kinematic
+(G log-scales, then three offsets a marker).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Hessian:
                 for second in term.slots:
                     for lag in _lags(first, second):
                         if lag >= 0:
-                            patterns[lag] |= self._touched(first, second)
+                            patterns[lag] |= self._touched(first, second, self._movers(second))
         patterns[0] = np.tril(patterns[0] | patterns[0].T)
         return patterns
 
@@ -85,34 +85,33 @@ class Hessian:
         pairs = [lag for t in self.compiled for s in t.slots for o in t.slots for lag in _lags(s, o)]
         return max(pairs, default=0)
 
-    def _touched(self, first: Slot, second: Slot) -> np.ndarray:
-        """Entries (Q, Q) that a pair of slots touches."""
-        d, depends = self.shape[1], self.problem.kinematics.depends
+    def _touched(self, first: Slot, second: Slot, of_second: np.ndarray) -> np.ndarray:
+        """Entries (Q, …) that a pair of slots touches; ``of_second`` (items, …) is what moves the second."""
         pairs = np.unique(np.stack([first.items, second.items], axis=1), axis=0)
-
-        def carriers(slot: Slot, items: np.ndarray) -> np.ndarray:
-            return depends[items] if slot.kind == "position" else np.eye(d, dtype=bool)[items]
-
-        left, right = carriers(first, pairs[:, 0]), carriers(second, pairs[:, 1])
+        left, right = self._movers(first)[pairs[:, 0]], of_second[pairs[:, 1]]
         return (left.T.astype(float) @ right.astype(float)) > 0
+
+    def _movers(self, slot: Slot) -> np.ndarray:
+        """(items, Q) bool: which degrees of freedom move the items of a slot."""
+        return (
+            self.problem.kinematics.depends if slot.kind == "position" else np.eye(self.shape[1], dtype=bool)
+        )
 
     @cached_property
     def _border(self) -> np.ndarray:
         """(Q, P) bool: entries of B that any term touches."""
-        d, kinematics = self.shape[1], self.problem.kinematics
-        border = np.zeros((d, self.n_parameters), dtype=bool)
-        depends, grows = kinematics.depends, kinematics.grows
-        g, k = kinematics.n_groups, self.problem.parameters.n_kinematic
-        border[:, :g] = (depends.T.astype(float) @ grows.astype(float)) > 0
-        if k > g:
-            border[:, g:k] = np.repeat(depends.T, 3, axis=1)
+        border = np.zeros((self.shape[1], self.n_parameters), dtype=bool)
+        k = self.problem.parameters.n_kinematic
+        own = np.repeat(np.eye(self.n_markers, dtype=bool), 3, axis=1)
+        moved_by = np.concatenate([self.problem.kinematics.grows, own], axis=1)[:, :k]  # (M, K)
         for term in self.compiled:
-            parameters = {int(i) for s in term.slots if s.kind == "parameter" for i in s.items}
-            for slot in term.slots:
-                if slot.kind != "parameter" and parameters:
-                    items = np.unique(slot.items)
-                    moved = depends[items] if slot.kind == "position" else np.eye(d, dtype=bool)[items]
-                    border[np.ix_(moved.any(0), sorted(parameters))] = True
+            parameters = sorted({int(i) for s in term.slots if s.kind == "parameter" for i in s.items})
+            positions = [s for s in term.slots if s.kind == "position" and k]
+            for slot in (s for s in term.slots if s.kind != "parameter"):
+                moving = self._movers(slot)[np.unique(slot.items)].any(0)
+                border[np.ix_(moving, parameters)] = True
+                for other in positions:
+                    border[:, :k] |= self._touched(slot, other, moved_by)
         return border
 
     @cached_property
@@ -157,10 +156,10 @@ class Hessian:
             if not term.quadratic:
                 sums.add(term, values, pull, exact=exact)
         blocks, border, corner = sums.carried()
-        for lag, constant in enumerate(self._constant(found)[0]):
+        fixed = self._constant(found)
+        for block, constant in zip([*blocks, border, corner], fixed, strict=True):
             if constant is not None:
-                blocks[lag] += constant
-        corner += self._constant(found)[1]
+                block += constant
         if exact and linear is not None:
             bent = kinematic_curvature(self.problem.kinematics, linear, position_pull)
             blocks[0] += bent.states
@@ -168,14 +167,14 @@ class Hessian:
             corner[: len(bent.scales), : len(bent.scales)] += np.diag(bent.scales)
         return blocks, border, corner
 
-    def _constant(self, found: list[Evaluation]) -> tuple[list[np.ndarray | None], np.ndarray]:
-        """Part of A and D that never changes: linear residuals of q and θ with the squared loss."""
+    def _constant(self, found: list[Evaluation]) -> list[np.ndarray | None]:
+        """Part of A's blocks, B and D that never changes: linear residuals with the squared loss."""
         if not hasattr(self, "_fixed"):
             sums = _Sums(self, None)
             for term, values in zip(self.compiled, found, strict=True):
                 if term.quadratic:
                     sums.add(term, values, np.zeros((term.n_variables, term.size)), exact=False)
-            self._fixed = ([b if b.any() else None for b in sums.blocks], sums.corner)
+            self._fixed = [b if b.any() else None for b in (*sums.blocks, sums.border, sums.corner)]
         return self._fixed
 
 
@@ -183,7 +182,7 @@ class _Sums:
     """Second derivatives being summed, before they are carried through the kinematics."""
 
     def __init__(self, whole: Hessian, linear: Linearised | None) -> None:
-        (n, d), p, m = whole.shape, whole.n_parameters, whole.n_markers
+        (n, d), p = whole.shape, whole.n_parameters
         self.whole, self.linear = whole, linear
         self.n_kinematic = whole.problem.parameters.n_kinematic
         self.blocks = [np.zeros((n, d, d)) for _ in range(1 + whole._reach)]
@@ -254,7 +253,7 @@ class _Sums:
         """Add values (K, 3, p) of a node and p parameters to what has been gathered for positions."""
         fixed = [other.item for other in others if other.item is not None]
         shape = (self.whole.shape[0] * self.whole.n_markers, 3)
-        if len(fixed) == len(others):
+        if len(set(fixed)) == len(others):
             total = (node.scatter @ values.reshape(len(values), -1)).reshape(*shape, len(fixed))
             key = tuple(fixed)
             self.outer[key] = self.outer[key] + total if key in self.outer else total
@@ -279,7 +278,7 @@ class _Sums:
             self.corner[:k, :k] += np.einsum("kai,abk,kbj->ij", left_theta, part, right_theta, optimize=True)
 
     def _carrier(self, slot: Slot) -> tuple[np.ndarray, np.ndarray]:
-        """∂(local variables of the slot)/∂q, (K, width, Q), and for the kinematic parameters (K, width, K)."""
+        """∂(local variables of the slot)/∂q, (K, width, Q), and for the kinematic parameters."""
         count, d = len(slot.frames), self.whole.shape[1]
         if slot.kind == "position":
             assert self.linear is not None and len(slot.nodes) == 1
@@ -377,7 +376,8 @@ class _Sums:
             cross = (turned.swapaxes(-1, -2) @ values.reshape(n, m, 3, -1)).sum(0)
             self._corner(np.arange(g, k), places, cross.reshape(3 * m, -1))
 
-    def _corner(self, rows: np.ndarray, columns: tuple[int, ...], values: np.ndarray) -> None:
+    def _corner(self, rows: np.ndarray, places: tuple[int, ...], values: np.ndarray) -> None:
+        columns = np.array(places)
         self.corner[np.ix_(rows, columns)] += values
         self.corner[np.ix_(columns, rows)] += values.T
 

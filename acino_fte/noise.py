@@ -1,9 +1,12 @@
 """Measurement noise from the data: one robust scale for every marker, with the species' table as prior.
 
-A residual of a good fit is smaller than the noise, since the fit follows the noise: with v the variance of the
-predicted pixel, Var(r) = σ² − v (leverage; Rousseeuw and Leroy 1987, ch. 6), so residuals are divided by
-√(1 − v/σ²) first. Their scale is found from the median absolute deviation and refined by the variance of
-what lies within ±c of zero, corrected for the truncation (σ² = E[r² | |r| < cσ] / κ, κ = 1 − 2cφ(c)/(2Φ(c) − 1)),
+A residual of a good fit is smaller than the noise, since the fit follows the noise: with v the variance of
+the predicted pixel, Var(r) = σ² − v (leverage; Rousseeuw and Leroy 1987, ch. 6), so residuals are divided by
+√(1 − v/σ²) first. Their scale is found from the median absolute deviation and refined by the variance of what
+lies within ±cσ of zero, corrected for the truncation,
+
+    σ² = E[r² | |r| < cσ] / κ,   κ = 1 − 2cφ(c)/(2Φ(c) − 1),
+
 which is little disturbed by gross errors and nearly as precise as the standard deviation without them. The
 table counts like ``PRIOR_COUNT`` observations, in the logarithm.
 """

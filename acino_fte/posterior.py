@@ -95,7 +95,7 @@ def factorise(
     corner: np.ndarray,
     multipliers: np.ndarray | None = None,
 ) -> ArrowFactor:
-    """Factor of a Hessian for (q, θ/σ_θ), given for (q, θ); bounds count with the square of their multipliers."""
+    """Factor of a Hessian for (q, θ/σ_θ), given for (q, θ); bounds count by their multipliers squared."""
     sd = problem.parameters.sd
     corner = corner * np.outer(sd, sd)
     blocks = [blocks[0].copy(), *blocks[1:]]

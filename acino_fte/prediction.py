@@ -16,7 +16,7 @@ from acino_fte.parameters import POSE, Parameters, cayley_matrix
 
 
 def corrected(camera: Camera, correction: np.ndarray) -> Camera:
-    """The camera after a correction (ρ, d) (6,): x_camera = C(ρ)(R x + t) + d (:mod:`acino_fte.parameters`)."""
+    """The camera after a correction (ρ, d) (6,): x_camera = C(ρ)(R x + t) + d, by Cayley's rotation C."""
     turn = cayley_matrix(correction[:3])
     return replace(
         camera, rotation=turn @ camera.rotation, translation=camera.translation @ turn.T + correction[3:]
