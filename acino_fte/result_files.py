@@ -9,6 +9,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from secrets import token_hex
 from typing import TYPE_CHECKING
@@ -27,11 +30,24 @@ if TYPE_CHECKING:
 
 FILES = ("fte.nc", "positions.csv", "states.csv", "metrics.json", "sequence.yaml", "figures", "report.html")
 """What a result folder may hold; ``states.csv`` only from a method with a skeleton."""
-_MARKS = ("fte.nc", "metrics.json")  # a folder that holds both is a result
 _ANOTHER = "choose another output folder with -o"
 
 
-def check_output_folder(out: Path | str, *, input_folder: Path | str | None = None) -> Path:
+@dataclass(frozen=True)
+class Contents:
+    """What an output folder may hold: its name in messages, all files, and those by which it is known."""
+
+    name: str
+    files: tuple[str, ...]
+    marks: tuple[str, ...]
+
+
+RESULT = Contents("result", FILES, ("fte.nc", "metrics.json"))
+
+
+def check_output_folder(
+    out: Path | str, *, input_folder: Path | str | None = None, contents: Contents = RESULT
+) -> Path:
     """Refuse an output folder before a long run rather than after it.
 
     Parameters
@@ -40,6 +56,8 @@ def check_output_folder(out: Path | str, *, input_folder: Path | str | None = No
         Where the result shall go. It may be absent, empty, or an earlier result, which will be replaced.
     input_folder : Path, optional
         The sequence (a folder, or a file in it), which is never written to.
+    contents : Contents
+        What it is going to hold; an earlier one of the same kind may be replaced.
 
     Returns
     -------
@@ -66,7 +84,7 @@ def check_output_folder(out: Path | str, *, input_folder: Path | str | None = No
             remedy=_ANOTHER,
         )
     if folder.is_dir():
-        _check_ours(folder)
+        _check_ours(folder, contents)
     return folder
 
 
@@ -89,21 +107,23 @@ def _check_apart(folder: Path, source: Path) -> None:
         )
 
 
-def _check_ours(folder: Path) -> None:
+def _check_ours(folder: Path, contents: Contents) -> None:
     """An existing folder may be empty or an earlier result with nothing added to it."""
     entries = sorted(p.name for p in folder.iterdir())
     if not entries:
         return
-    foreign = [name for name in entries if name not in FILES and not name.startswith(".")]
-    result = all((folder / name).is_file() for name in _MARKS)
-    if not result or foreign:
+    foreign = [name for name in entries if name not in contents.files and not name.startswith(".")]
+    ours = all((folder / name).is_file() for name in contents.marks)
+    if not ours or foreign:
         listed = ", ".join((foreign or entries)[:5]) + (", …" if len(foreign or entries) > 5 else "")
         raise InputError(
-            "The output folder holds files that are not a result of this program, and would be lost."
-            if not result
-            else "The output folder holds an earlier result with other files added, which would be lost.",
+            f"The output folder holds files that are not a {contents.name} of this program, "
+            "and would be lost."
+            if not ours
+            else f"The output folder holds an earlier {contents.name} with other files added, "
+            "which would be lost.",
             file=folder,
-            expected="a new or empty folder, or an earlier result (which is replaced)",
+            expected=f"a new or empty folder, or an earlier {contents.name} (which is replaced)",
             found=listed,
             remedy=f"{_ANOTHER}, or move these files away",
         )
@@ -141,10 +161,7 @@ def save_result(
         The folder may not be written; see :func:`check_output_folder`.
     """
     folder = check_output_folder(out, input_folder=input_folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    working = folder.with_name(f".{folder.name}.tmp-{token_hex(4)}")
-    working.mkdir()
-    try:
+    with written_whole(folder, RESULT) as working:
         write_tables(result, working)
         if figures:
             from acino_fte.plots import save_figures
@@ -153,17 +170,25 @@ def save_result(
         from acino_fte.report import write_report
 
         write_report(result, working)
-        _check_again(folder)
-        _swap(working, folder)
-    finally:
-        shutil.rmtree(working, ignore_errors=True)
     return folder
 
 
-def _check_again(folder: Path) -> None:
-    """Something may have been put into the output folder while the run lasted."""
-    if folder.is_dir():
-        _check_ours(folder)
+@contextmanager
+def written_whole(folder: Path, contents: Contents) -> Iterator[Path]:
+    """A working folder beside an output folder that was checked, which takes its name at the end.
+
+    On an exception the output folder stays as it was.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    working = folder.with_name(f".{folder.name}.tmp-{token_hex(4)}")
+    working.mkdir()
+    try:
+        yield working
+        if folder.is_dir():  # something may have been put into it while the run lasted
+            _check_ours(folder, contents)
+        _swap(working, folder)
+    finally:
+        shutil.rmtree(working, ignore_errors=True)
 
 
 def _swap(new: Path, folder: Path) -> None:
