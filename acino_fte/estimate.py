@@ -33,13 +33,13 @@ from acino_fte.parameters import check_families, describe
 from acino_fte.posterior import Posterior, posterior
 from acino_fte.prediction import corrected_cameras, predict, time_offsets
 from acino_fte.problem import Assumptions, FTEOptions, FTEProblem, build_fte
-from acino_fte.result import FTEResult
+from acino_fte.result import FTEResult, Status
 from acino_fte.sequence import Sequence
 from acino_fte.solve import Minimum, Progress, SolveOptions, minimise, rates
 from acino_fte.terms import Term
 from acino_fte.tune import tune
 
-_ROUGH = 3e-3  # relative gain per iteration at which the first fit ends
+_ROUGH = 2e-3  # relative gain per iteration at which the first fit ends
 _NEAR = 3e-4  # and the second, whose residuals the noise is estimated from
 NOISES = ("estimated", "table")
 
@@ -130,6 +130,13 @@ def estimate_fte(
     return run.result()
 
 
+class _Interrupted(Exception):
+    """Ctrl-C during a fit: the estimate ends with what there is."""
+
+    def __init__(self, problem: FTEProblem, minimum: Minimum) -> None:
+        self.problem, self.minimum = problem, minimum
+
+
 class _Estimate:
     """One estimate on its way: the current trajectory and what has been assumed and found so far."""
 
@@ -167,11 +174,16 @@ class _Estimate:
         with self._timed("initialise"):
             self.q = initial_trajectory(self.sequence, self.kinematics, self.options.problem)
         with self._timed("solve"):
-            problem, minimum = self._fits()
-            spread = self._posterior(problem, minimum) if self.options.covariance else None
-            if self.options.tune_noise and spread is not None:
-                problem, minimum, spread = self._tuned(problem, minimum, spread)
-        return self._result(problem, minimum, spread)
+            spread = None
+            try:
+                problem, minimum = self._fits()
+                if self.options.covariance or self.options.tune_noise:
+                    spread = self._posterior(problem, minimum)
+                if self.options.tune_noise and spread is not None:
+                    problem, minimum, spread = self._tuned(problem, minimum, spread)
+            except _Interrupted as stopped:
+                problem, minimum, spread = stopped.problem, stopped.minimum, None
+        return self._result(problem, minimum, spread if self.options.covariance else None)
 
     # --- stages ------------------------------------------------------------------------------------
 
@@ -203,6 +215,8 @@ class _Estimate:
             minimum = minimise(problem, self.q, self.options.solver, self.progress, enough, theta)
         self.q, self.theta = minimum.q, minimum.theta
         self.iterations += minimum.iterations
+        if minimum.status is Status.INTERRUPTED:
+            raise _Interrupted(problem, minimum)
         return problem, minimum
 
     def _problem(self) -> FTEProblem:

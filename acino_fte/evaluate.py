@@ -63,8 +63,8 @@ def climb(
 ) -> list[dict[str, Any]]:
     """The ladder: from no parameters to those of the result, family by family.
 
-    ``top`` is the score of the last rung. Each rung has ``fit``, ``reprojection_px`` {median, within_20px} in the cameras that took part,
-    ``heldout_px`` and ``heldout_nominal_px``.
+    ``top`` is the score of the last rung. Each rung has ``fit``, ``reprojection_px`` {median, within_20px}
+    in the cameras that took part, ``heldout_px`` and ``heldout_nominal_px``.
     """
     families = fitted_families(result)
     rungs = []

@@ -12,6 +12,7 @@ from acino_fte.errors import InputError
 from acino_fte.kinematics import Kinematics
 from acino_fte.losses import Loss
 from acino_fte.problem import FTEOptions, build_problem
+from acino_fte.result import Status
 from acino_fte.sequence import Sequence
 from acino_fte.solve import SolveOptions, minimise
 from acino_fte.terms import point_term
@@ -61,7 +62,10 @@ def smooth_inverse_kinematics(
     term = point_term(points, _POINT_SD, Loss("cauchy", {"c": 2.0}))
     problem = build_problem(kinematics, fps, frames, [term], options)
     settings = SolveOptions(max_iter=60, tolerance=1.0, acceptable_tolerance=10.0)
-    return minimise(problem, pose_start(kinematics, points), settings, enough=_ENOUGH).q
+    minimum = minimise(problem, pose_start(kinematics, points), settings, enough=_ENOUGH)
+    if minimum.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt  # a start that was cut off is nothing to keep
+    return minimum.q
 
 
 def pose_start(kinematics: Kinematics, points: np.ndarray) -> np.ndarray:

@@ -181,9 +181,9 @@ def minimise(
 ) -> Minimum:
     """Minimise a problem from q (N, Q) and θ (P,), zero when left out, by its condensed lowering.
 
-    Ctrl-C ends it with the best iterate so far and the status ``interrupted``. ``enough`` stops it early
-    once two iterations in a row lower the objective by less than this fraction: for a start, not for a
-    result, so that Ctrl-C then raises KeyboardInterrupt.
+    Ctrl-C ends it with the best iterate so far and the status ``interrupted``. ``enough`` stops it early,
+    ``acceptable``, once two iterations in a row lower the objective by less than this fraction: for a start,
+    not for a result.
     """
     import cyipopt
 
@@ -197,9 +197,9 @@ def minimise(
         solver.add_option(name, value)
     with _stop_on_interrupt(callbacks):
         x, info = solver.solve(x0)
-    if callbacks.stop and enough:
-        raise KeyboardInterrupt  # a start that was cut off is nothing to keep
     status = IPOPT_STATUS.get(info["status"], Status.FAILED)
+    if status is Status.INTERRUPTED and not callbacks.stop:
+        status = Status.ACCEPTABLE  # near enough to its minimum
     check_linear_solver(status, callbacks.iterations, options)
     value = float(info["obj_val"])
     if not status.ok and callbacks.best[0] < np.inf:

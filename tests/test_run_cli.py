@@ -214,7 +214,7 @@ from acino_fte import solve
 report = solve._Callbacks.intermediate
 
 def intermediate(self, mode, iteration, *rest):
-    if iteration == {iteration} and bool(self.enough) is {early}:
+    if iteration == {iteration} and {when}:
         os.kill(os.getpid(), signal.SIGINT)
     return report(self, mode, iteration, *rest)
 
@@ -227,8 +227,9 @@ main()
 
 def test_an_interrupted_run_is_saved_and_marked(recording, here):
     """A program of its own that gets SIGINT, as by Ctrl-C, in the second iteration of its solve."""
-    code = INTERRUPT.format(iteration=2, early=False)
-    done = start(sys.executable, "-c", code, str(recording), "--no-figures", cwd=here)
+    code = INTERRUPT.format(iteration=2, when="not self.enough")
+    plain = ["--fit", "none", "--noise", "table", "--no-swaps"]
+    done = start(sys.executable, "-c", code, str(recording), "--no-figures", *plain, cwd=here)
     assert done.returncode == 3, done.stderr
     assert "interrupted" in done.stderr
     assert "Traceback" not in done.stderr
@@ -238,9 +239,20 @@ def test_an_interrupted_run_is_saved_and_marked(recording, here):
     assert xr.load_dataset(here / "out" / "gallop" / "fte.nc").attrs["status"] == "interrupted"
 
 
+def test_an_interrupted_first_fit_is_saved_and_marked(recording, here):
+    """The rough fit that noise and sides are judged by: what it had is kept, and nothing follows."""
+    code = INTERRUPT.format(iteration=1, when="self.enough == estimate._ROUGH")
+    code = code.replace("from acino_fte import solve", "from acino_fte import estimate, solve")
+    done = start(sys.executable, "-c", code, str(recording), "--no-figures", cwd=here)
+    assert done.returncode == 3, done.stderr
+    metrics = json.loads((here / "out" / "gallop" / "metrics.json").read_text())
+    assert metrics["status"] == "interrupted"
+    assert "uncertainty" not in metrics
+
+
 def test_an_interrupt_before_there_is_anything_to_save(recording, here):
     """While looking for a start."""
-    code = INTERRUPT.format(iteration=1, early=True)
+    code = INTERRUPT.format(iteration=1, when="self.enough")
     done = start(sys.executable, "-c", code, str(recording), "--no-figures", cwd=here)
     assert done.returncode == 1, done.stderr
     assert "interrupted" in done.stderr
