@@ -104,6 +104,12 @@ def check_cameras(sequence: Sequence, cameras: list[str] | None) -> list[str]:
             expected="a recording of three cameras or more",
             found=f"{len(names)}: {', '.join(names)}",
         )
+    if cameras is not None and not cameras:
+        raise InputError(
+            "No camera is named to leave out.",
+            key="--holdout-cameras",
+            expected=f"'each', or some of {', '.join(names)}",
+        )
     for name in names if cameras is None else cameras:
         if name not in names:
             raise InputError(
