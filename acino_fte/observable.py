@@ -7,7 +7,9 @@ family is judged given those before it, which keep their priors,
     M = S_FF − S_FG (S_GG + Λ_G)⁻¹ S_GF,
 
 in units of its prior's standard deviations: an eigenvalue below a tenth is a direction of which the data say
-next to nothing (they narrow the prior by less than 5 %), and does not count for the rank.
+next to nothing (they narrow the prior by less than 5 %), and does not count for the rank. The size of the set
+of cameras, which no picture shows, is held by a term of its own (:func:`acino_fte.terms.size_terms`); its
+direction counts as known.
 """
 
 from __future__ import annotations
