@@ -322,7 +322,7 @@ class _Estimate:
             parameters=self._parameters(problem, minimum, spread),
             q_sd=None if spread is None else spread.q_sd,
             position_covariance=None if spread is None else spread.positions,
-            findings=tuple(self._findings(observed, predicted, sd)),
+            findings=(*self._at_bounds(problem), *self._findings(observed, predicted, sd)),
         )
 
     def _seconds(self) -> dict[str, float]:
@@ -332,7 +332,7 @@ class _Estimate:
 
     def _parameters(self, problem: FTEProblem, minimum: Minimum, spread: Posterior | None) -> dict[str, Any]:
         sd = None if spread is None else spread.theta_sd
-        found = describe(problem.parameters, minimum.theta, sd)
+        found = describe(problem.parameters, minimum.theta, sd, self.sequence.cameras.names[0])
         if self.options.noise == "estimated":
             values = np.asarray(self.assumed.sd_px).tolist()
             found["noise_px"] = dict(zip(self.skeleton.marker_names, values, strict=True))
@@ -340,6 +340,14 @@ class _Estimate:
             factors = np.asarray(self.assumed.noise_factors).tolist()
             found["process_noise_factor"] = dict(zip(self.skeleton.dof_names, factors, strict=True))
         return found
+
+    def _at_bounds(self, problem: FTEProblem) -> list[str]:
+        """A parameter at its bound wants to go where the prior says it cannot be: the model is wrong there."""
+        held = np.abs(self.theta) > (1 - 1e-3) * problem.parameters.bound
+        names = [name for name, at in zip(problem.parameters.names, held, strict=True) if at]
+        if not names:
+            return []
+        return [f"at their bounds, where the prior takes them to be impossible: {', '.join(names)}"]
 
     def _findings(self, observed: np.ndarray, predicted: np.ndarray, sd: np.ndarray) -> list[str]:
         cameras, frames = self.sequence.cameras.names, self.sequence.frames

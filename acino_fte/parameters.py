@@ -16,6 +16,7 @@ bounded. The first camera stays as it is: it fixes the origin of time and the fr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -137,14 +138,14 @@ class Parameters:
 
 
 def declare(
-    families: Iterable[str], skeleton: Skeleton, cameras: list[str], fps: float, widths: PriorWidths
+    families: Iterable[str], skeleton: Skeleton | None, cameras: list[str], fps: float, widths: PriorWidths
 ) -> Parameters:
-    """The parameters of some families for a skeleton and cameras, by name."""
+    """The parameters of some families, for a skeleton (None: of cameras only) and cameras by name."""
     chosen = check_families(families)
     entries: list[Parameter] = []
-    if "scale" in chosen:
+    if "scale" in chosen and skeleton is not None:
         entries += [Parameter("scale", g, "", widths.scale, _REACH * widths.scale) for g in skeleton.groups]
-    if "offsets" in chosen:
+    if "offsets" in chosen and skeleton is not None:
         entries += [
             Parameter("offsets", marker, axis, widths.offset, _REACH * widths.offset)
             for marker in skeleton.marker_names
@@ -194,38 +195,48 @@ def cayley_matrix(rho: np.ndarray) -> np.ndarray:
     return np.eye(3) + (skew + 0.5 * skew @ skew) / (1 + 0.25 * float(rho @ rho))
 
 
-def describe(parameters: Parameters, theta: np.ndarray, sd: np.ndarray | None) -> dict[str, Any]:
-    """Values, and standard deviations under ``<family>_sd``, as :class:`~acino_fte.result.FTEResult` has them.
+def describe(
+    parameters: Parameters, theta: np.ndarray, sd: np.ndarray | None, reference: str | None = None
+) -> dict[str, Any]:
+    """Values, and standard deviations under ``<family>_sd``, as a result has them.
 
-    The first camera is listed with zeros. Scales are factors; their standard deviation is s·sd(λ).
+    Scales are factors, with the standard deviation s·sd(λ). The ``reference`` camera is listed with zeros.
     """
     result: dict[str, Any] = {}
-    for suffix, values in (("", theta), ("_sd", sd)):
-        if values is None:
+    for name, family in _FAMILY_KEYS.items():
+        if family not in parameters.families:
             continue
-        for name, family in _FAMILY_KEYS.items():
-            found = [
-                (p, float(v)) for p, v in zip(parameters.entries, values, strict=True) if p.family == family
-            ]
-            if not found:
-                continue
-            table: dict[str, Any] = {}
-            for p, v in found:
-                if family == "scale":
-                    factor = float(np.exp(theta[parameters.place("scale", p.owner)]))
-                    table[p.owner] = factor * v if suffix else factor
-                elif family == "delay":
-                    table[p.owner] = v
-                elif family == "offsets":
-                    table.setdefault(p.owner, []).append(v)
-                else:
-                    pose = table.setdefault(p.owner, {"rotation_rad": [], "translation_m": []})
-                    pose["translation_m" if p.component.startswith("t") else "rotation_rad"].append(v)
-            if family == "extrinsics" and not suffix:
-                for pose in table.values():
-                    pose["rotation_rad"] = rotation_vector(np.array(pose["rotation_rad"])).tolist()
-            result[name + suffix] = table
+        zero = _ZEROS.get(family) if reference else None
+        first = {} if zero is None else {str(reference): zero}
+        result[name] = {**first, **_table(parameters, family, theta)}
+        if family == "scale":
+            result[name] = {group: math.exp(value) for group, value in result[name].items()}
+        elif family == "extrinsics":
+            result[name] = {
+                camera: {**pose, "rotation_rad": rotation_vector(np.array(pose["rotation_rad"])).tolist()}
+                for camera, pose in result[name].items()
+            }
+        if sd is not None:
+            result[f"{name}_sd"] = {**first, **_table(parameters, family, sd)}
+            if family == "scale":
+                result[f"{name}_sd"] = {g: result[name][g] * v for g, v in result[f"{name}_sd"].items()}
     return result
+
+
+def _table(parameters: Parameters, family: str, values: np.ndarray) -> dict[str, Any]:
+    """Values of a family by owner: a number, three of them, or a pose."""
+    table: dict[str, Any] = {}
+    for parameter, value in zip(parameters.entries, values.tolist(), strict=True):
+        if parameter.family != family:
+            continue
+        if family == "offsets":
+            table.setdefault(parameter.owner, []).append(value)
+        elif family == "extrinsics":
+            pose = table.setdefault(parameter.owner, {"rotation_rad": [], "translation_m": []})
+            pose["translation_m" if parameter.component.startswith("t") else "rotation_rad"].append(value)
+        else:
+            table[parameter.owner] = value
+    return table
 
 
 _FAMILY_KEYS = {
@@ -233,4 +244,8 @@ _FAMILY_KEYS = {
     "marker_offset_m": "offsets",
     "time_offset_s": "delay",
     "extrinsics": "extrinsics",
+}
+_ZEROS: dict[str, Any] = {
+    "delay": 0.0,
+    "extrinsics": {"rotation_rad": [0.0, 0.0, 0.0], "translation_m": [0.0, 0.0, 0.0]},
 }

@@ -1,9 +1,9 @@
 """Residuals: formulas declared once as SymPy expressions, and what both lowerings make of them.
 
 A :class:`Residual` speaks of *handles* (a marker's position, a degree of freedom, its velocity or
-acceleration, now or some frames ago; a global parameter) and of named data. The explicit lowering takes it as declared
-(:func:`residual_program`); the condensed one takes it with velocities and accelerations replaced by
-backward differences of q, and with first and second derivatives (:func:`lower`).
+acceleration, now or some frames ago; a global parameter) and of named data. The explicit lowering takes it
+as declared (:func:`residual_program`); the condensed one takes it with velocities and accelerations replaced
+by backward differences of q, and with first and second derivatives (:func:`lower`).
 """
 
 from __future__ import annotations
@@ -95,8 +95,9 @@ class Lowered:
     """A residual in terms of positions, q and parameters alone, as programs.
 
     ``inputs`` lists the local variables in order, as handles of the kinds ``position``, ``dof`` and
-    ``parameter``, a position counting three. ``programs`` are ``value`` (components, guards), ``slope`` (components, guards, then
-    ∂component/∂variable) and ``curvature`` (the same, then the second derivatives for variable pairs i ≥ j).
+    ``parameter``, a position counting three. ``programs`` are ``value`` (components, guards), ``slope``
+    (components, guards, then ∂component/∂variable) and ``curvature`` (the same, then the second derivatives
+    for variable pairs i ≥ j).
     """
 
     inputs: tuple[Handle, ...]

@@ -328,7 +328,7 @@ def solve_fte(
         method=f"fte-{lowering}",
         seconds={**(seconds or {}), "solve": time.perf_counter() - began},
         options={"problem": problem.options.summary(), "solver": options.summary()},
-        parameters=describe(problem.parameters, minimum.theta, None),
+        parameters=describe(problem.parameters, minimum.theta, None, cameras.names[0]),
     )
 
 
