@@ -3,7 +3,8 @@
 1. start: triangulation and inverse kinematics (:mod:`acino_fte.initialise`), and a rough fit with the
    species' proportions and table of noise and the given calibration;
 2. measurement noise from the residuals (:mod:`acino_fte.noise`), exchanged sides and better candidates
-   (:mod:`acino_fte.assignments`), and which parameters the data can tell (:mod:`acino_fte.observable`);
+   (:mod:`acino_fte.assignments`; the rough fit is repeated while these change), and which parameters the data
+   can tell (:mod:`acino_fte.observable`);
 3. a fit with the parameters, then noise and assignments once more;
 4. the final fit, to the solver's tolerance, and its covariance (:mod:`acino_fte.posterior`).
 
@@ -40,6 +41,7 @@ from acino_fte.terms import Term
 from acino_fte.tune import tune
 
 _ROUGH = 2e-3  # relative gain per iteration at which the first fit ends
+_LOOKS = 4  # most rough fits: sides that are exchanged in a whole camera take more than one look
 _NEAR = 3e-4  # and the second, whose residuals the noise is estimated from
 NOISES = ("estimated", "table")
 
@@ -191,12 +193,13 @@ class _Estimate:
         options = self.options
         adaptive = options.noise == "estimated" or options.swaps or options.contact
         if adaptive or options.fit is None:
-            problem, minimum = self._fit(_ROUGH)
-            self._look(problem, minimum, None)
+            for _ in range(_LOOKS):
+                if not self._look(*self._fit(_ROUGH), None):
+                    break
             self._choose()
         else:
             self.fit = options.fit
-        if adaptive and (self.fit or options.contact):
+        if adaptive:
             problem, minimum = self._fit(_NEAR)
             estimated = options.noise == "estimated"
             self._look(problem, minimum, self._posterior(problem, minimum) if estimated else None)
@@ -223,22 +226,33 @@ class _Estimate:
         options = replace(self.options.problem, fit=self.fit)
         return build_fte(self.sequence, self.kinematics, options, self.assumed).with_terms(*self.extra)
 
-    def _look(self, problem: FTEProblem, minimum: Minimum, spread: Posterior | None) -> None:
-        """Let the residuals of a fit decide on assignments, noise and stance."""
-        if self.options.swaps:
-            self._assign(problem, minimum)
+    def _look(self, problem: FTEProblem, minimum: Minimum, spread: Posterior | None) -> bool:
+        """Let the residuals of a fit decide on noise, assignments and stance; whether an assignment changed.
+
+        The noise comes first: sides are judged by it, and a table that is too small exaggerates the evidence.
+        """
+        self._measure(problem, minimum, spread)
+        changed = self.options.swaps and self._assign(problem, minimum)
+        if changed:
             with self._timed("build"):
                 problem = self._problem()
-        if self.options.noise == "estimated":
-            sd = estimate_noise(problem, minimum, spread, self.table)
-            self.assumed = replace(self.assumed, sd_px=sd)
+            self._measure(problem, minimum, spread)
         if self.options.contact:
             positions = problem.kinematics.positions(minimum.q, problem.proportions(minimum.theta))
             terms, self.contacts = contact_terms(problem, positions, self.sequence)
             self.extra = tuple(terms)
+        return changed
 
-    def _assign(self, problem: FTEProblem, minimum: Minimum) -> None:
+    def _measure(self, problem: FTEProblem, minimum: Minimum, spread: Posterior | None) -> None:
+        """Noise from the residuals."""
+        if self.options.noise == "estimated":
+            sd = estimate_noise(problem, minimum, spread, self.table)
+            self.assumed = replace(self.assumed, sd_px=sd)
+
+    def _assign(self, problem: FTEProblem, minimum: Minimum) -> bool:
+        """Sides and candidates from the residuals; whether that changed any."""
         names, threshold = self.skeleton.marker_names, self.options.problem.likelihood
+        before = self.assignment
         self.assignment = resolve(
             self.skeleton,
             self.detected,
@@ -250,6 +264,8 @@ class _Estimate:
             previous=self.assignment,
         )
         self.assumed = replace(self.assumed, pixels=self.assignment.pixels)
+        changed = self.assignment.n_changed if before is None else self.assignment.n_different(before)
+        return changed > 0
 
     def _choose(self) -> None:
         """Which parameters to fit: those asked for, or those that the data can tell."""
@@ -342,7 +358,7 @@ class _Estimate:
         return found
 
     def _at_bounds(self, problem: FTEProblem) -> list[str]:
-        """A parameter at its bound wants to go where the prior says it cannot be: the model is wrong there."""
+        """A parameter at its bound wants to go where the prior says it cannot be: the model is wrong."""
         held = np.abs(self.theta) > (1 - 1e-3) * problem.parameters.bound
         names = [name for name, at in zip(problem.parameters.names, held, strict=True) if at]
         if not names:
