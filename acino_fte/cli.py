@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from acino_fte import cli_run, cli_simulate, cli_skeleton
+from acino_fte import cli_compare, cli_run, cli_simulate, cli_skeleton
 
 app = typer.Typer(
     name="acino-fte",
@@ -14,6 +14,7 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
 )
 app.command("run")(cli_run.run)
+app.command("compare")(cli_compare.compare)
 app.command("simulate")(cli_simulate.simulate)
 app.add_typer(cli_skeleton.app, name="skeleton")
 
