@@ -72,7 +72,7 @@ def compare(
     """Compare methods on one SEQUENCE or several: errors, cameras left out, coverage, truth and time.
 
     Writes comparison.csv, .md, .tex, .json and a figure. Leaves with 0 when every solver converged, 3 when
-    one did not, 2 when the input is wrong for all methods; one that fails is a line in the table.
+    one did not, 2 when the input is wrong for all methods; one that refuses the input is a line in the table.
     """
     with reported_errors():
         from acino_fte.cli_estimate import Source, frame_range
@@ -89,7 +89,7 @@ def compare(
             recordings = _distinct([_read(source, options, holdout_cameras, step) for source in sources])
             _tell(recordings)
             blocks = [_block(recording, variants, options, step) for recording in recordings]
-        _refuse_if_all_failed(blocks)
+        _refuse_if_all_did(blocks)
         settings = {
             "methods": [variant.name for variant in variants],
             "holdout_cameras": holdout_cameras,
@@ -199,10 +199,10 @@ def _tell(recordings: list[_Recording]) -> None:
 
 def _block(recording: _Recording, variants: list[Variant], options: EstimateOptions, step: _Step) -> Block:
     """Apply every variant to a sequence."""
-    from acino_fte.comparison import Block, apply_variant, block_of, failure
+    from acino_fte.comparison import Block, apply_variant, block_of, refusal
 
     if isinstance(recording.found, InputError):
-        rows = tuple(failure(variant, recording.found) for variant in variants)
+        rows = tuple(refusal(variant, recording.found) for variant in variants)
         return Block(recording.name, "could not be read", rows)
     sequence, kinematics = recording.found
     applied = []
@@ -215,10 +215,10 @@ def _block(recording: _Recording, variants: list[Variant], options: EstimateOpti
     return block_of(sequence, recording.name, applied, options.problem.likelihood)
 
 
-def _refuse_if_all_failed(blocks: list[Block]) -> None:
+def _refuse_if_all_did(blocks: list[Block]) -> None:
     """The input is wrong when no method could be applied to anything; what all of them say is said once."""
     rows = [row for block in blocks for row in block.rows]
-    if not all(row.failed for row in rows):
+    if not all(row.refused for row in rows):
         return
     errors = list({str(row.error): row.error for row in rows if row.error is not None}.values())
     if len(errors) == 1:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 IN_SAMPLE, LEFT_OUT, NOMINAL = "Reprojection error", "Left out, cross-fitted", "Left out, nominal"
 TRUTH, TIME = "Truth", "Time"
-FAILED = "failed"
-"""Status of a method that could not be applied."""
+REFUSED = "refused"
+"""Status of a method that could not be applied to the input (``failed`` is a solver's)."""
 MEAN = "mean"
 """Status of a row that is a mean over sequences."""
 
@@ -164,15 +164,15 @@ class Row:
     ----------
     variant : Variant
     status : str
-        How the solver ended, :data:`FAILED` or :data:`MEAN`.
+        How the solver ended, :data:`REFUSED` or :data:`MEAN`.
     numbers : dict
         Column name → value, None where undefined; shares between 0 and 1.
     metrics : dict
-        The fields of metrics.json, scored on all detections; empty when failed.
+        The fields of metrics.json, scored on all detections; empty when refused.
     notes : tuple of str
-        Why it failed, what it lacks.
+        Why it was refused, what it lacks.
     error : InputError, optional
-        Why it failed.
+        Why it was refused.
     """
 
     variant: Variant
@@ -183,19 +183,19 @@ class Row:
     error: InputError | None = None
 
     @property
-    def failed(self) -> bool:
+    def refused(self) -> bool:
         """Whether the method could not be applied."""
-        return self.status == FAILED
+        return self.status == REFUSED
 
     @property
     def unconverged(self) -> bool:
         """Whether the solver ended without an optimum."""
-        return self.status not in ("converged", "acceptable", FAILED, MEAN)
+        return self.status not in ("converged", "acceptable", REFUSED, MEAN)
 
     @property
     def title(self) -> str:
         """Title of the variant, with what is wrong about it."""
-        wrong = self.status.replace("_", " ") if self.failed or self.unconverged else ""
+        wrong = self.status.replace("_", " ") if self.refused or self.unconverged else ""
         return f"{self.variant.title} ({wrong})" if wrong else self.variant.title
 
 
@@ -269,7 +269,7 @@ def apply_variant(
     try:
         result = estimate(variant.method, sequence, kinematics, options, progress=progress)
     except InputError as error:
-        return failure(variant, error)
+        return refusal(variant, error)
     _stop_if_interrupted(result)
     evaluation: dict[str, Any] = {}
     notes: tuple[str, ...] = ()
@@ -292,9 +292,9 @@ def _stop_if_interrupted(result: FTEResult) -> None:
         raise KeyboardInterrupt
 
 
-def failure(variant: Variant, error: InputError) -> Row:
+def refusal(variant: Variant, error: InputError) -> Row:
     """The row of a variant that refused a recording."""
-    return Row(variant, FAILED, columns_of({}), {}, (error.problem,), error)
+    return Row(variant, REFUSED, columns_of({}), {}, (error.problem,), error)
 
 
 def scored(result: FTEResult, likelihood: float) -> dict[str, Any]:
@@ -349,9 +349,9 @@ def mean_block(blocks: list[Block]) -> Block:
     ]
     rows = []
     for variant in dict.fromkeys(row.variant for block in blocks for row in block.rows):
-        found = [row for block in blocks for row in block.rows if row.variant == variant and not row.failed]
+        found = [row for block in blocks for row in block.rows if row.variant == variant and not row.refused]
         if not found:
-            rows.append(Row(variant, FAILED, columns_of({}), notes=("failed on every sequence",)))
+            rows.append(Row(variant, REFUSED, columns_of({}), notes=("refused every sequence",)))
             continue
         values = {column.name: _mean(row.numbers[column.name] for row in found) for column in COLUMNS}
         notes = [] if len(found) == len(blocks) else [f"mean of {len(found)} of {len(blocks)} sequences"]

@@ -92,7 +92,7 @@ def markdown(blocks: list[Block]) -> str:
         lines.append(f"|---|{'--:|' * len(columns)}")
         for row in block.rows:
             cells = [column.shown(row.numbers[column.name]) for column in columns]
-            if row.failed:
+            if row.refused:
                 cells = [_escaped("; ".join(row.notes), _MARKDOWN), *[""] * (len(columns) - 1)]
             lines.append(f"| {' | '.join([_escaped(_starred(row), _MARKDOWN), *cells])} |")
         notes = [f"- * {note}" for note in _footnotes(block)]
@@ -125,11 +125,11 @@ def latex(blocks: list[Block]) -> str:
 
 def _starred(row: Row) -> str:
     """Title of a row, with a star when a note belongs to it."""
-    return f"{row.title} *" if row.notes and not row.failed else row.title
+    return f"{row.title} *" if row.notes and not row.refused else row.title
 
 
 def _footnotes(block: Block) -> list[str]:
-    return [f"{row.variant.title}: {note}" for row in block.rows if not row.failed for note in row.notes]
+    return [f"{row.variant.title}: {note}" for row in block.rows if not row.refused for note in row.notes]
 
 
 def _latex_heads(columns: list[Column]) -> list[str]:
@@ -145,8 +145,8 @@ def _latex_heads(columns: list[Column]) -> list[str]:
 
 
 def _latex_row(row: Row, columns: list[Column]) -> str:
-    if row.failed:
-        why = _tex(f"failed: {'; '.join(row.notes)}")
+    if row.refused:
+        why = _tex(f"refused: {'; '.join(row.notes)}")
         return rf"{_tex(row.variant.title)} & \multicolumn{{{len(columns)}}}{{l}}{{{why}}} \\"
     cells = " & ".join(_tex(column.shown(row.numbers[column.name])) for column in columns)
     return rf"{_tex(_starred(row))} & {cells} \\"

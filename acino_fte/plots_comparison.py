@@ -26,8 +26,8 @@ _NOMINAL = ("s", ORANGE, "■ left out, nominal", "heldout_nominal_median_px", "
 def comparison_figure(blocks: list[Block], mean: Block | None = None) -> Figure:
     """Median error, share within 20 px, coverage, error against the truth and time, by method.
 
-    Several sequences are small pale marks, and their mean is a large one. What failed says so; what did not
-    converge is red.
+    Several sequences are small pale marks, and their mean is a large one. The names of methods that refused
+    the input or did not converge say so in red.
     """
     top = mean or blocks[0]
     series = [s for s in (_IN_SAMPLE, _FITTED, _NOMINAL) if _any(blocks, s[3])]
@@ -130,10 +130,10 @@ def _logarithmic(axes: Axes) -> None:
 
 
 def _name_rows(axes: Axes, block: Block) -> None:
-    """Names of the methods at the left; red when the solver did not converge or the method failed."""
+    """Names of the methods at the left; red when the solver did not converge or the input was refused."""
     axes.set_yticks(range(len(block.rows)), [row.title for row in block.rows])
     for label, row in zip(axes.get_yticklabels(), block.rows, strict=True):
-        if row.failed or row.unconverged:
+        if row.refused or row.unconverged:
             label.set_color(RED)
     axes.tick_params(axis="y", length=0)
 

@@ -178,7 +178,7 @@ def test_the_mean_gives_every_sequence_the_same_weight():
             variant, status, columns_of({"reprojection_px": error, "truth_mm": truth and {"mpjpe": truth}})
         )
 
-    lost = Row(tri, "failed", columns_of({}), notes=("nothing to see",))
+    lost = Row(tri, "refused", columns_of({}), notes=("nothing to see",))
     first = Block("a", "", (row(fte, 2.0, 5.0), row(tri, 3.0, 7.0)))
     second = Block("b", "", (row(fte, 4.0, None, "max_time"), lost))
     mean = mean_block([first, second])
@@ -190,7 +190,7 @@ def test_the_mean_gives_every_sequence_the_same_weight():
     assert part.numbers["reprojection_median_px"] == 3.0
     assert part.notes == ("mean of 1 of 2 sequences",)
     text = markdown([first, second, mean])
-    assert "| Triangulation (failed) | nothing to see |" in text
+    assert "| Triangulation (refused) | nothing to see |" in text
     assert "| FTE (max time) | 4.00 |" in text
     assert "Triangulation \\* | 3.00 |" in text
 
@@ -234,7 +234,7 @@ def test_latex_is_well_formed(compared):
 def test_latex_escapes_what_comes_from_files():
     row = Row(VARIANTS["fte"], "max_iterations", columns_of({"reprojection_px": {"median": 2.345}}))
     hostile = r"a_b & \input{x} $%#~^{"
-    lost = Row(VARIANTS["tri"], "failed", columns_of({}), notes=(hostile,))
+    lost = Row(VARIANTS["tri"], "refused", columns_of({}), notes=(hostile,))
     noted = replace(row, notes=(hostile,))
     text = latex([Block(hostile, "3 frames", (row, lost)), Block("b", "4 frames", (noted, lost))])
     rows = balanced(text)
@@ -264,7 +264,7 @@ def test_two_sequences_of_one_name_and_one_that_cannot_be_read(recording, here):
     out = here / "out" / "comparison"
     table = pd.read_csv(out / "comparison.csv")
     assert list(table.sequence) == [f"{recording.parent.name}/{ODD}", f"later/{ODD}", "empty"]
-    assert list(table.status) == ["converged", "converged", "failed"]
+    assert list(table.status) == ["converged", "converged", "refused"]
     assert table.seconds.isna().tolist() == [False, False, True]
     assert "empty is left out" in words(result.output)
     found = json.loads((out / "comparison.json").read_text())
@@ -282,10 +282,10 @@ def test_a_method_that_fails_is_a_line(recording, here, monkeypatch):
     assert result.exit_code == 0, result.output
     assert "There is nothing to filter." in result.output
     out = here / "out" / "comparison"
-    assert "| EKF (failed) | There is nothing to filter. |" in (out / "comparison.md").read_text()
-    assert "failed: There is nothing to filter." in (out / "comparison.tex").read_text()
+    assert "| EKF (refused) | There is nothing to filter. |" in (out / "comparison.md").read_text()
+    assert "refused: There is nothing to filter." in (out / "comparison.tex").read_text()
     row = pd.read_csv(out / "comparison.csv").iloc[1]
-    assert (row.status, row.note) == ("failed", "There is nothing to filter.")
+    assert (row.status, row.note) == ("refused", "There is nothing to filter.")
     methods = json.loads((out / "comparison.json").read_text())["sequences"][ODD]["methods"]
     assert methods["ekf"]["reason"].startswith("There is nothing to filter.")
 
@@ -311,15 +311,15 @@ def test_when_nothing_works_the_input_is_wrong(recording, here, monkeypatch):
     assert not list(here.iterdir())
 
 
-def test_unconverged(recording, here, monkeypatch):
-    pretend(monkeypatch, {"sba": Status.MAX_ITERATIONS})
+@pytest.mark.parametrize("status", [Status.MAX_ITERATIONS, Status.FAILED])
+def test_unconverged(recording, here, monkeypatch, status):
+    pretend(monkeypatch, {"sba": status})
     result = compare(recording, "--methods", "sba,tri", "--frames", ":4")
     assert result.exit_code == 3
-    assert "SBA (max iterations)" in result.output
-    assert list(pd.read_csv(here / "out" / "comparison" / "comparison.csv").status) == [
-        "max_iterations",
-        "converged",
-    ]
+    assert f"SBA ({str(status).replace('_', ' ')})" in result.output
+    table = pd.read_csv(here / "out" / "comparison" / "comparison.csv")
+    assert list(table.status) == [str(status), "converged"]
+    assert table.reprojection_median_px.notna().all()
 
 
 def test_interrupted(recording, here, monkeypatch):
