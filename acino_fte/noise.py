@@ -17,9 +17,8 @@ import math
 
 import numpy as np
 
-from acino_fte.compiled_terms import CompiledTerm, Evaluation
 from acino_fte.condensed import Condensed
-from acino_fte.posterior import Posterior
+from acino_fte.posterior import Posterior, leverage
 from acino_fte.problem import FTEProblem
 from acino_fte.solve import Minimum
 
@@ -27,7 +26,6 @@ PRIOR_COUNT = 20.0
 _CUT = 2.5
 _MAD = 1.482602218505602  # 1/Φ⁻¹(¾)
 _ROUNDS = 4
-_LEVERAGE = 0.9  # a residual is never divided by less than √(1 − this)
 
 
 def robust_scale(residuals: np.ndarray) -> float:
@@ -59,7 +57,8 @@ def estimate_noise(
     for term, found in condensed.evaluated():
         if term.term.family != "meas":
             continue
-        scaled = found.e * term.sd / np.sqrt(1.0 - _leverage(term, found, posterior))
+        share = 0.0 if posterior is None else leverage(term, found, posterior.positions)
+        scaled = found.e * term.sd / np.sqrt(1.0 - share)
         for marker in np.unique(term.term.items[:, 0]):
             pools[marker].append(scaled[:, term.term.items[:, 0] == marker].ravel())
     result = table.copy()
@@ -71,14 +70,3 @@ def estimate_noise(
             logs = count * math.log(sigma) + PRIOR_COUNT * math.log(table[m])
             result[m] = math.exp(logs / (count + PRIOR_COUNT))
     return result
-
-
-def _leverage(term: CompiledTerm, found: Evaluation, posterior: Posterior | None) -> np.ndarray | float:
-    """v/σ² of every component (c, K)."""
-    if posterior is None:
-        return 0.0
-    slot = next(s for s in term.slots if s.kind == "position")
-    slope = found.slope[:, slot.rows]
-    covariance = posterior.positions[slot.frames, slot.items]
-    variance = np.einsum("cak,kab,cbk->ck", slope, covariance, slope, optimize=True)
-    return np.clip(variance / term.sd**2, 0.0, _LEVERAGE)
