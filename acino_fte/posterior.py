@@ -9,15 +9,16 @@ follow by the chain rule,
 A variable held at its bound by a multiplier z has, beside the bound, a density that falls like exp(−z·x): its
 variance is 1/z², which enters as information z².
 
-A robust loss is not the logarithm of the noise's density, and its curvature not the information in the data: an
-observation is worth E[ψ']²/E[ψ²] (Huber 1964), while the Hessian has E[ψ']. So the data's part of the Hessian
-is multiplied by
+A robust loss is not the logarithm of the noise's density, and its curvature not the information in the
+data: an observation is worth E[ψ']²/E[ψ²] (Huber 1964), while the Hessian has E[ψ']. So the data's part of
+the Hessian is multiplied by
 
     w = Σ ψ'(e) / Σ ψ²(e)
 
-over the residuals e, which are divided by √(1 − leverage) as in :mod:`acino_fte.noise`: then the information of
-the data equals the variance of their score (Lyddon, Holmes and Walker 2019). For Gaussian noise of the assumed
-σ, w is 1 with the squared loss and 1.21 with Geman and McClure's at c = 5; noise beyond the assumed lowers it.
+over the residuals e, which are divided by √(1 − leverage) as in :mod:`acino_fte.noise`: then the
+information of the data equals the variance of their score (Lyddon, Holmes and Walker 2019). For Gaussian
+noise of the assumed σ, w is 1 with the squared loss and 1.21 with Geman and McClure's at c = 5; noise
+beyond the assumed lowers it.
 
 Shapes: N frames, Q degrees of freedom, M markers, P parameters.
 """
