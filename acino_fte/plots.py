@@ -14,6 +14,7 @@ import matplotlib
 from acino_fte.parameter_table import parameter_tables
 from acino_fte.plots_histograms import camera_figure, error_figure, marker_figure
 from acino_fte.plots_joints import joint_figure, motion_figure
+from acino_fte.plots_ladder import ladder_figure
 from acino_fte.plots_parameters import parameter_figure
 from acino_fte.plots_positions import position_figure
 from acino_fte.plots_style import STYLE
@@ -38,6 +39,7 @@ FIGURES: dict[str, tuple[str, Callable[[FTEResult], Figure]]] = {
     "uncertainty": ("Uncertainty of the markers", uncertainty_figure),
     "body_motion": ("Motion of the body", motion_figure),
     "parameters": ("Estimated parameters", parameter_figure),
+    "ladder": ("What each family of parameters is worth in cameras left out", ladder_figure),
     "camera_views": ("The skeleton in the cameras", view_figure),
 }
 """File name → what it shows, and the function that draws it."""
@@ -46,12 +48,14 @@ FIGURES: dict[str, tuple[str, Callable[[FTEResult], Figure]]] = {
 def figures_of(result: FTEResult) -> list[str]:
     """Names of the figures that have something to show of a result.
 
-    ``joint_angles`` needs joints, ``uncertainty`` covariances and ``parameters`` estimated parameters;
+    ``joint_angles`` needs joints, ``uncertainty`` covariances, ``parameters`` estimated parameters and
+    ``ladder`` a ladder of cameras left out;
     ``marker_positions`` is for the methods without joints, and for error bands.
     """
     joints, spread = bool(result.q.shape[1]), result.position_covariance is not None
     shown = {"joint_angles": joints, "marker_positions": spread or not joints, "uncertainty": spread}
     shown["parameters"] = bool(parameter_tables(result.parameters))
+    shown["ladder"] = bool(result.evaluation.get("ladder"))
     return [name for name in FIGURES if shown.get(name, True)]
 
 

@@ -18,6 +18,8 @@ from acino_fte.report_page import PAGE, SCRIPT, STYLE, VIEWER
 from acino_fte.report_scene import scene
 from acino_fte.report_tables import (
     error_tables,
+    heldout_cards,
+    heldout_section,
     number,
     parameter_section,
     run_tables,
@@ -60,6 +62,7 @@ def write_report(result: FTEResult, folder: Path | str) -> Path:
         "<h2>The trajectory</h2>" + VIEWER.replace("@grid@", f"{data['grid']['step']:g}"),
         _figures(folder / "figures"),
         "<h2>Reprojection error</h2>" + error_tables(metrics["reprojection_px"]),
+        heldout_section(metrics),
         parameter_section(result.parameters, metrics.get("parameter_errors", {}), usual_px),
         uncertainty_section(metrics.get("uncertainty", {}), metrics.get("truth_mm", {})),
         "<h2>The run</h2>" + run_tables(metrics),
@@ -121,6 +124,7 @@ def _cards(metrics: dict[str, Any]) -> str:
         cards.append((share(error["coverage"]), "of the observed markers have a position"))
     if "truth_mm" in metrics:
         cards.append((number(metrics["truth_mm"]["mpjpe"], "mm", 2), "mean distance to the truth"))
+    cards += heldout_cards(metrics)
     items = "".join(f'<div class="card"><b>{escape(v)}</b><span>{escape(t)}</span></div>' for v, t in cards)
     return f'<div class="cards">{items}</div>'
 

@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from acino_fte.ladder_table import rung_titles
 from acino_fte.parameter_table import ParameterTable, parameter_tables
 
+_LEFT_OUT = (("heldout_px", "cross-fitted"), ("heldout_nominal_px", "nominal"))
 _ERROR_UNITS = {"time_offset_ms": "ms", "marker_offset_mm": "mm", "position_mm": "mm", "rotation_deg": "°"}
 
 
@@ -43,6 +45,64 @@ def error_tables(error: Mapping[str, Any]) -> str:
         bad = {name for name, part in error[key].items() if (part["within_20px"] or 0.0) < 0.5}
         tables.append(table(caption + "; shaded: under half within 20 px", head, lines, bad))
     return f'<div class="tables">{"".join(tables)}</div>'
+
+
+def heldout_cards(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """(number, what it is) of cameras left out; none without."""
+    cards = []
+    for key, name in _LEFT_OUT:
+        if found := metrics.get(key):
+            cards.append((number(found["median"], "px"), f"median error in cameras left out, {name}"))
+            cards.append((share(found["within_20px"]), f"within 20 px in cameras left out, {name}"))
+    return cards
+
+
+def heldout_section(metrics: Mapping[str, Any]) -> str:
+    """Errors in cameras left out, by camera; and the ladder, when it was climbed."""
+    if not all(key in metrics for key, _ in _LEFT_OUT):
+        return ""
+    fitted, nominal = (metrics[key] for key, _ in _LEFT_OUT)
+    head = ("", *_heldout_head(("median (px)", "p90 (px)", "within 20 px")), "coverage", "n")
+    rows = [
+        _heldout_row(name, part, nominal["per_camera"][name]) for name, part in fitted["per_camera"].items()
+    ]
+    rows.append(_heldout_row("all", fitted, nominal))
+    text = (
+        "Each camera in turn took no part in the estimate and is then predicted: with a time offset and a "
+        "correction of its own, fitted in the other half of the frames (cross-fitted), and as it was "
+        "calibrated (nominal)."
+    )
+    parts = [table("Estimated without the camera; of what it detected", head, rows)]
+    if metrics.get("ladder"):
+        parts.append(_ladder(metrics["ladder"]))
+    return f'<h2>Cameras left out</h2><p>{text}</p><div class="tables">{"".join(parts)}</div>'
+
+
+def _heldout_head(titles: Iterable[str]) -> list[str]:
+    return [f"{name}: {title}" for _, name in _LEFT_OUT for title in titles]
+
+
+def _heldout_row(name: str, fitted: Mapping[str, Any], nominal: Mapping[str, Any]) -> tuple[str, ...]:
+    cells = []
+    for part in (fitted, nominal):
+        cells += [number(part["median"], "", 1), number(part["p90"], "", 1), share(part["within_20px"])]
+    return name, *cells, share(fitted["coverage"]), f"{fitted['n']:,}"
+
+
+def _ladder(rungs: list[Mapping[str, Any]]) -> str:
+    """A row a rung: what is fitted, the error where it was fitted and in cameras left out."""
+    head = (
+        "fitted",
+        "took part: median (px)",
+        "within 20 px",
+        *_heldout_head(("median (px)", "within 20 px")),
+    )
+    rows = []
+    for title, rung in zip(rung_titles(rungs), rungs, strict=True):
+        parts = [rung["reprojection_px"], *(rung[key] for key, _ in _LEFT_OUT)]
+        cells = [c for part in parts for c in (number(part["median"], "", 1), share(part["within_20px"], 1))]
+        rows.append((title, *cells))
+    return table("What each family of parameters is worth: a row adds one to the row above", head, rows)
 
 
 def run_tables(metrics: Mapping[str, Any]) -> str:

@@ -146,6 +146,36 @@ def with_estimates(result, seed=1):
     )
 
 
+def with_evaluation(result):
+    """The result as ``--holdout-cameras each --ladder`` leaves it; the first camera cannot be predicted."""
+    names = result.sequence.cameras.names
+
+    def scores(median):
+        return {"median": median, "p90": 3 * median, "within_20px": 0.7, "coverage": 0.95, "n": 1234}
+
+    def left_out(median):
+        lost = {"median": None, "p90": None, "within_20px": None, "coverage": 0.0, "n": 56}
+        others = {name: scores(median + c) for c, name in enumerate(names[1:], 1)}
+        return {**scores(median), "per_camera": {names[0]: lost, **others}}
+
+    def rung(fit, took_part, fitted, nominal):
+        error = {"median": took_part, "within_20px": 0.8}
+        return {
+            "fit": fit,
+            "reprojection_px": error,
+            "heldout_px": scores(fitted),
+            "heldout_nominal_px": scores(nominal),
+        }
+
+    ladder = [
+        rung([], 11.3, 16.3, 15.8),
+        rung(["delay"], 10.1, 14.6, 15.2),
+        rung(["delay", "extrinsics"], 8.0, 12.25, 13.75),
+    ]
+    evaluation = {"heldout_px": left_out(12.25), "heldout_nominal_px": left_out(13.75), "ladder": ladder}
+    return replace(result, evaluation=evaluation)
+
+
 def triangulated(result):
     """The result as a method without a skeleton leaves it: no joints, and no position from a single view."""
     unseen = np.isfinite(result.observed).all(-1).sum(axis=1) < 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection, PolyCollection
 from matplotlib.image import imread
-from synthetic_result import make_result, triangulated, with_estimates
+from synthetic_result import make_result, triangulated, with_estimates, with_evaluation
 
 from acino_fte.plots import FIGURES, figures_of, save_figures
 from acino_fte.plots_joints import joint_groups
@@ -142,8 +142,9 @@ def test_best_frame_is_in_the_middle_third(result):
 
 def test_figures_follow_what_there_is(result):
     plain = set(figures_of(result))
-    assert plain == set(FIGURES) - {"marker_positions", "uncertainty", "parameters"}
-    assert set(figures_of(with_estimates(result))) == set(FIGURES)
+    assert plain == set(FIGURES) - {"marker_positions", "uncertainty", "parameters", "ladder"}
+    assert set(figures_of(with_estimates(result))) == set(FIGURES) - {"ladder"}
+    assert set(figures_of(with_evaluation(result))) == plain | {"ladder"}
     assert set(figures_of(triangulated(result))) == plain - {"joint_angles"} | {"marker_positions"}
 
 
@@ -209,6 +210,28 @@ def test_the_parameter_figure_shows_units_and_the_truth(result):
     (panel,) = (axes for axes in figure.axes if axes.get_xlabel() == "Offset (ms)")
     (cross,) = (line for line in panel.lines if line.get_marker() == "x")
     assert (cross.get_xdata()[0], cross.get_ydata()[0]) == (pytest.approx(5.0), 1)
+
+
+def test_the_ladder_shows_every_rung(result):
+    figure = FIGURES["ladder"][1](with_evaluation(result))
+    median, near = figure.axes
+    labels = [label.get_text() for label in median.get_xticklabels()]
+    assert labels == ["nothing", "+ time offsets", "+ camera poses"]
+    assert [list(line.get_ydata()) for line in median.lines] == [
+        [11.3, 10.1, 8.0],
+        [16.3, 14.6, 12.25],
+        [15.8, 15.2, 13.75],
+    ]
+    assert {value for line in near.lines for value in line.get_ydata()} == {70.0, 80.0}
+    assert (median.get_ylabel(), near.get_ylabel()) == ("Median error (px)", "Within 20 px (%)")
+    for text in ("● cameras that took part", "◆ left out, cross-fitted", "■ left out, nominal"):
+        assert text in words(figure)
+    image = BytesIO()
+    lost = with_evaluation(result)
+    lost.evaluation["ladder"][1]["heldout_px"]["median"] = None
+    FIGURES["ladder"][1](lost).savefig(image, format="png", dpi=40)
+    assert len(image.getvalue()) > 1000
+    assert any("no ladder was climbed" in word for word in words(FIGURES["ladder"][1](result)))
 
 
 def test_smooth_path_does_not_jump_when_markers_go(result):

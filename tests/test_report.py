@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from PIL import Image
-from synthetic_result import make_result, triangulated, with_estimates
+from synthetic_result import make_result, triangulated, with_estimates, with_evaluation
 
 from acino_fte.plots import FIGURES
 from acino_fte.report import _fill, headline_colour, number, share, write_report
@@ -185,6 +185,36 @@ def test_findings_parameters_and_uncertainty(result, tmp_path):
     assert share(found["ellipsoid_coverage_95"], 1) in page
     plain = page_of(result, tmp_path)
     assert "<h2>Uncertainty" not in plain and "<h2>Estimated parameters" not in plain
+
+
+def test_cameras_left_out(result, tmp_path):
+    evaluated = with_evaluation(result)
+    page = page_of(evaluated, tmp_path)
+    parser = Balance()
+    parser.feed(page)
+    assert parser.faults == parser.open == []
+    assert "<b>12.2 px</b><span>median error in cameras left out, cross-fitted" in page
+    assert "<b>70 %</b><span>within 20 px in cameras left out, nominal" in page
+    first, second, _ = result.sequence.cameras.names
+    dashes = "<td>–</td>" * 6
+    assert f"<td>{first}</td>{dashes}<td>0 %</td><td>56</td>" in page
+    assert f"<td>{second}</td><td>13.2</td><td>39.8</td><td>70 %</td><td>14.8</td>" in page
+    assert "<td>all</td><td>12.2</td>" in page
+    assert (
+        "<td>+ camera poses</td><td>8.0</td><td>80.0 %</td><td>12.2</td><td>70.0 %</td><td>13.8</td>" in page
+    )
+    assert (
+        page.index("<h2>Reprojection error") < page.index("<h2>Cameras left out") < page.index("<h2>The run")
+    )
+
+
+def test_cameras_left_out_without_a_ladder(result, tmp_path):
+    evaluated = with_evaluation(result)
+    del evaluated.evaluation["ladder"]
+    page = page_of(evaluated, tmp_path)
+    assert "<h2>Cameras left out" in page and "+ camera poses" not in page
+    plain = page_of(result, tmp_path)
+    assert "left out" not in plain
 
 
 def test_page_of_a_method_without_a_skeleton(result, tmp_path):
