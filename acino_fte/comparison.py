@@ -151,6 +151,7 @@ COLUMNS: tuple[Column, ...] = (
     Column(
         "heldout_nominal_within_20px", ("heldout_nominal_px", "within_20px"), NOMINAL, "within 20 px", "%", 1
     ),
+    Column("heldout_nominal_coverage", ("heldout_nominal_px", "coverage"), NOMINAL, "coverage", "%", 1),
     Column("truth_mpjpe_mm", ("truth_mm", "mpjpe"), TRUTH, "mean error", "mm", 1),
     Column("seconds", ("seconds", "estimate"), TIME, "estimate", "s", 2),
 )

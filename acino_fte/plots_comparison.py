@@ -66,8 +66,9 @@ def _any(blocks: list[Block], name: str) -> bool:
 
 
 def _coverage(blocks: list[Block]) -> list[tuple[str, str, str]]:
-    """In the cameras that took part, and in those left out (the same whether cross-fitted or not)."""
-    marks = [(*_IN_SAMPLE[:2], "coverage"), (*_FITTED[:2], "heldout_coverage")]
+    """In the cameras that took part, and in those left out."""
+    series = ((_IN_SAMPLE, ""), (_FITTED, "heldout_"), (_NOMINAL, "heldout_nominal_"))
+    marks = [(s[0], s[1], f"{prefix}coverage") for s, prefix in series]
     return [mark for mark in marks if _any(blocks, mark[2])]
 
 
