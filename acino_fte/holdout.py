@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from acino_fte import delay
 from acino_fte.cameras import Camera, CameraArray
 from acino_fte.compiled_terms import CompiledTerm, Point
 from acino_fte.errors import InputError, did_you_mean
@@ -202,8 +203,9 @@ def fit_camera(
     parameters = declare(chosen, None, names, fps, widths or PriorWidths())
     theta = np.zeros(len(parameters))
     near = np.isfinite(positions).all(-1)
-    for shift in (1, -1) if "delay" in chosen else ():  # the stencil of a delay needs its neighbours
-        near &= np.roll(np.isfinite(positions).all(-1), shift, axis=0)
+    if "delay" in chosen:
+        newest = delay.stencil(np.arange(len(positions)), len(positions))
+        near = near[newest - np.arange(delay.NODES)[:, None]].all(0)
     shown = np.where(near[..., None], pixels, np.nan)
     term = measurement_term(camera, shown, sd_px, Loss("geman_mcclure"), len(positions), parameters)
     if term is None or not len(parameters):
