@@ -58,7 +58,7 @@ def estimate(
     Raises
     ------
     InputError
-        There is no such method, or the detections do not suffice.
+        There is no such method, it cannot estimate what ``fit`` names, or the detections do not suffice.
     """
     from acino_fte.estimate import EstimateOptions, estimate_fte
 
@@ -71,6 +71,7 @@ def estimate(
         )
     if method == "fte":
         return estimate_fte(sequence, kinematics, chosen, progress=progress, seconds=seconds)
+    _check_fit(method, chosen.fit or ())
     if method == "tri":
         from acino_fte.baseline_tri import estimate_tri
 
@@ -89,3 +90,16 @@ def estimate(
     from acino_fte.baseline_ekf import estimate_ekf
 
     return estimate_ekf(sequence, kinematics, chosen.problem, progress=progress, seconds=seconds)
+
+
+def _check_fit(method: str, fit: tuple[str, ...]) -> None:
+    """Raise InputError when a baseline is asked for parameters that it does not have."""
+    able = ("extrinsics",) if method == "sba" else ()
+    unable = [family for family in fit if family not in able]
+    if unable:
+        raise InputError(
+            f"The method '{method}' does not estimate {', '.join(unable)}.",
+            key="fit",
+            expected=f"{' or '.join(able)}, or nothing" if able else "nothing",
+            remedy="leave it out, or use the method 'fte'",
+        )

@@ -12,6 +12,7 @@ from acino_fte.baseline_sba import Bundle, correct, estimate_sba, left_jacobian,
 from acino_fte.baseline_tri import estimate_tri, marker_sd, point_covariance, robust_cost
 from acino_fte.cameras import CameraArray
 from acino_fte.errors import InputError
+from acino_fte.estimate import EstimateOptions
 from acino_fte.losses import DEFAULTS, Loss
 from acino_fte.methods import BASELINES, estimate
 from acino_fte.parameters import PriorWidths
@@ -297,7 +298,7 @@ def test_estimate(lizard, clean, method):
         method,
         clean,
         lizard,
-        FTEOptions(likelihood=0.3),
+        EstimateOptions(FTEOptions(likelihood=0.3)),
         progress=lambda *a: calls.append(a),
         seconds={"load": 1},
     )
@@ -313,7 +314,8 @@ def test_estimate(lizard, clean, method):
 def test_estimate_refuses(lizard, clean):
     with pytest.raises(InputError, match="did you mean 'sba'"):
         estimate("sbaa", clean, lizard)
-    for method in ("tri", "ekf"):
-        with pytest.raises(InputError, match="does not correct cameras"):
-            estimate(method, clean, lizard, cameras_too=True)
-    assert estimate("sba", clean, lizard, cameras_too=True).parameters["extrinsics"]
+    for method, fit in (("tri", "extrinsics"), ("ekf", "delay"), ("sba", "scale")):
+        with pytest.raises(InputError, match=f"does not estimate {fit}"):
+            estimate(method, clean, lizard, EstimateOptions(fit=(fit,)))
+    moved = EstimateOptions(fit=("extrinsics",))
+    assert estimate("sba", clean, lizard, moved).parameters["extrinsics"]
