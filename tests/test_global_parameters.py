@@ -142,6 +142,13 @@ def _mixed(handles, data, let):
     return [product * speed + first * second - data["level"], z * first**2 + speed**2 / 50], []
 
 
+def _twist(handles, data, _let):
+    """One marker now and before, in different ways."""
+    now, before = handles
+    return [now[0] * before[1] - data["half"] * now[2] * before[0]], []
+
+
+TWIST = Residual("twist", (Handle("position"), Handle("position", 1)), ("half",), ("a",), "m²", _twist)
 TIED = Residual("tied", (Handle("dof"), Handle("parameter", item=1)), (), ("d",), "rad", _tied)
 MIXED = Residual(
     "mixed",
@@ -185,6 +192,15 @@ def test_own_terms_with_proportions(lizard, name, families):
     assert Condensed(alone).objective(x) > 0
     check_derivatives(alone, x)
     check_structure(Condensed(alone), x)
+
+
+@pytest.mark.parametrize("families", [("scale",), ("offsets",), FAMILIES], ids="+".join)
+def test_a_marker_now_and_before_in_different_ways(lizard, families):
+    problem, x = fitted(lizard, families, seed=4)
+    frames, markers = (a.ravel() for a in np.mgrid[1:N, 0:6])
+    sd = np.full(len(frames), 0.01)
+    term = Term("twist", TWIST, frames, markers[:, None], {"half": 0.5}, sd, Loss("cauchy"))
+    check_derivatives(replace(problem, terms=(term,)), x)
 
 
 @pytest.mark.parametrize("loss", ["squared", "cauchy"])

@@ -125,6 +125,17 @@ def test_without_detections_nothing_moves(lizard):
     assert not theta.any()
 
 
+def test_a_single_detection_moves_little(lizard):
+    """Seven parameters and two numbers: the priors decide."""
+    camera, positions = cameras_about()[0], lizard.positions(wandering(lizard))
+    pixels = np.full((N, 6, 2), np.nan)
+    pixels[7, 2] = camera.project(positions)[7, 2] + 4.0
+    parameters, theta = fit_camera(camera, pixels, positions, FPS, np.full(6, 2.0))
+    assert 0 < np.abs(theta / parameters.sd).max() < 1
+    error = seen(camera, positions, parameters, theta)[7, 2] - pixels[7, 2]
+    assert np.abs(error).max() < 2
+
+
 @pytest.mark.parametrize("lost", [0, 2, 20, N - 3, N - 1])
 def test_frames_whose_stencil_lacks_a_position_are_left_out(lizard, lost):
     """At both ends a stencil reaches two frames inwards."""

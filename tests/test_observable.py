@@ -148,16 +148,18 @@ def test_ranks_do_not_depend_on_the_units(lizard, unit, n):
     assert ranks({j.family: j for j in found}) == ranks(plain)
 
 
-@pytest.mark.parametrize("n", [1, 3])
-def test_ranks_are_those_of_the_dense_schur_complement(lizard, n):
+@pytest.mark.parametrize(("n", "sd_px"), [(1, 3.0), (3, 3.0), (2, 100.0), (4, 200.0)])
+def test_ranks_are_those_of_the_dense_schur_complement(lizard, n, sd_px):
+    """Each family given those before it that are told in full, and only those."""
     q = random_motion(lizard.skeleton, N, 0)
     sequence = make_sequence(lizard, q, cameras_about(n=n))
-    problem = build_fte(sequence, lizard, FTEOptions(fit=ORDER))
+    assumptions = Assumptions(sd_px=np.full(6, sd_px))
+    problem = build_fte(sequence, lizard, FTEOptions(fit=ORDER), assumptions)
     condensed = Condensed(problem)
     hessian = dense(condensed, condensed.pack(problem.clip(q), np.zeros(len(problem.parameters))))
     given = list(range(q.size))
-    for family, found in judged(lizard, q, n).items():
-        own = (q.size + problem.parameters.of_family(family)).tolist()
+    for found in observable(sequence, lizard, FTEOptions(), assumptions, q):
+        own = (q.size + problem.parameters.of_family(found.family)).tolist()
         assert found.count == len(own)
         if not own:
             continue
