@@ -34,7 +34,7 @@ def comparison_figure(blocks: list[Block], mean: Block | None = None) -> Figure:
     panels: list[tuple[str, str, list[tuple[str, str, str]]]] = [
         ("Reprojection error", "Median error (px)", [(s[0], s[1], s[3]) for s in series]),
         ("Within 20 px", "Of those with a position (%)", [(s[0], s[1], s[4]) for s in series]),
-        ("Coverage", "Observed and with a position (%)", _coverage(blocks)),
+        ("Coverage", "With a position (%)", _coverage(blocks)),
         ("Error against the truth", "Mean distance (mm)", [("o", BLUE, "truth_mpjpe_mm")]),
         ("Time for the estimate", "Time (s)", [("o", BLUE, "seconds")]),
     ]
