@@ -151,6 +151,8 @@ def _data_weight(condensed: Condensed, positions: np.ndarray, *, exact: bool) ->
     if not total.any():
         return 1.0
     bend, score, weight = total + _PRIOR_COUNT * gaussian
+    if exact and bend <= 0:
+        raise NotPositiveDefinite("most residuals lie where the loss bends down")
     return float(bend / score if exact else bend**2 / (score * weight))
 
 
