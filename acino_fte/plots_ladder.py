@@ -28,7 +28,7 @@ def ladder_figure(result: FTEResult) -> Figure:
     figure = new_figure(result, "What each family of parameters is worth", 8.6, 3.6, top=1.05)
     if not rungs:
         return blank(figure, "no ladder was climbed (--holdout-cameras each --ladder)")
-    margins(figure, 0.65, 0.25, 0.62, wspace=0.22)
+    margins(figure, 0.65, 0.25, 0.75, wspace=0.22)
     keys(figure, [(text, colour) for _, _, colour, text in _SERIES], 0.12, 0.66)
     panels = figure.subplots(1, 2)
     for axes, key, factor, label in (
@@ -37,11 +37,15 @@ def ladder_figure(result: FTEResult) -> Figure:
     ):
         for series in _SERIES:
             _line(axes, rungs, series, key, factor)
-        axes.set_xticks(range(len(rungs)), rung_titles(rungs))
+        titles = [
+            "\n".join(title.rsplit(" ", 1)) for title in rung_titles(rungs)
+        ]  # five fit beside each other
+        axes.set_xticks(range(len(rungs)), titles)
         axes.set_xlim(-0.35, len(rungs) - 0.65)
-        axes.margins(y=0.14)
         axes.set_ylabel(label)
-    panels[0].set_ylim(bottom=0.0)
+    panels[0].set_ylim(0.0, 1.12 * max(panels[0].dataLim.y1, 1.0))
+    low = min(panels[1].dataLim.y0, 90.0)
+    panels[1].set_ylim(low - 0.12 * (100.0 - low), 100.0)
     figure.text(
         0.5, 0.03, "Fitted beside the trajectory, one family after the other", ha="center", fontsize=9
     )

@@ -62,7 +62,7 @@ def heldout_section(metrics: Mapping[str, Any]) -> str:
     if not all(key in metrics for key, _ in _LEFT_OUT):
         return ""
     fitted, nominal = (metrics[key] for key, _ in _LEFT_OUT)
-    head = ("", *_heldout_head(("median (px)", "p90 (px)", "within 20 px")), "coverage", "n")
+    head = ("", *_heldout_head(("median (px)", "p90 (px)", "within 20 px", "coverage")), "n")
     rows = [
         _heldout_row(name, part, nominal["per_camera"][name]) for name, part in fitted["per_camera"].items()
     ]
@@ -85,8 +85,9 @@ def _heldout_head(titles: Iterable[str]) -> list[str]:
 def _heldout_row(name: str, fitted: Mapping[str, Any], nominal: Mapping[str, Any]) -> tuple[str, ...]:
     cells = []
     for part in (fitted, nominal):
-        cells += [number(part["median"], "", 1), number(part["p90"], "", 1), share(part["within_20px"])]
-    return name, *cells, share(fitted["coverage"]), f"{fitted['n']:,}"
+        cells += [number(part[key], "", 1) for key in ("median", "p90")]
+        cells += [share(part[key]) for key in ("within_20px", "coverage")]
+    return name, *cells, f"{fitted['n']:,}"
 
 
 def _ladder(rungs: list[Mapping[str, Any]]) -> str:

@@ -216,7 +216,7 @@ def test_the_ladder_shows_every_rung(result):
     figure = FIGURES["ladder"][1](with_evaluation(result))
     median, near = figure.axes
     labels = [label.get_text() for label in median.get_xticklabels()]
-    assert labels == ["nothing", "+ time offsets", "+ camera poses"]
+    assert labels == ["nothing", "+ time\noffsets", "+ camera\nposes"]
     assert [list(line.get_ydata()) for line in median.lines] == [
         [11.3, 10.1, 8.0],
         [16.3, 14.6, 12.25],
