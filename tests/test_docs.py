@@ -14,10 +14,13 @@ from pathlib import Path
 
 import pytest
 from test_new_species_tutorial import blocks, execute
+from typer.main import get_command
 
+from acino_fte.cli import app
 from acino_fte.data_tools.calibration import read_cameras
 from acino_fte.data_tools.load import load_sequence
 from acino_fte.losses import DEFAULTS
+from acino_fte.parameters import FAMILIES
 from acino_fte.result_files import FILES
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -29,6 +32,7 @@ SET_UP = [
 ]
 _NOT_HERE = {"new_species.md"}
 _KINDS = {"bash", "python", "yaml", "text"}
+_OTHERS = {"--check", "--help"}  # of ruff, of every command
 _NAMED = re.compile(r"# (?P<file>\S+\.yaml)\n")
 
 
@@ -129,6 +133,23 @@ def test_the_readme_lists_what_a_result_folder_holds() -> None:
 def test_the_theory_names_every_loss() -> None:
     text = (REPOSITORY / "docs" / "theory.md").read_text(encoding="utf-8")
     assert [name for name in DEFAULTS if name != "redescending" and f"`{name}`" not in text] == []
+
+
+def test_the_theory_names_every_family_of_parameters() -> None:
+    text = (REPOSITORY / "docs" / "theory.md").read_text(encoding="utf-8")
+    assert [name for name in FAMILIES if f"| `{name}` |" not in text] == []
+
+
+@pytest.mark.parametrize("page", [*PAGES, REPOSITORY / "CHANGELOG.md"], ids=page_id)
+def test_options_exist(page: Path) -> None:
+    known, commands = set(_OTHERS), [get_command(app)]
+    while commands:
+        command = commands.pop()
+        commands += getattr(command, "commands", {}).values()
+        for parameter in command.params:
+            known.update(parameter.opts, parameter.secondary_opts)
+    named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", page.read_text(encoding="utf-8")))
+    assert named - known == set()
 
 
 def test_the_equations_of_the_theory_are_numbered_in_order() -> None:
