@@ -8,6 +8,10 @@ Examples
 >>> import acino_fte as af                                       # doctest: +SKIP
 >>> sequence = af.load_sequence("examples/cheetah_gallop")       # doctest: +SKIP
 >>> kinematics = af.load_kinematics(af.load_skeleton("cheetah")) # doctest: +SKIP
+>>> result = af.estimate_fte(sequence, kinematics)               # doctest: +SKIP
+
+The trajectory problem alone, without estimating noise or parameters:
+
 >>> problem = af.build_fte(sequence, kinematics)                 # doctest: +SKIP
 >>> start = af.initial_trajectory(sequence, kinematics)          # doctest: +SKIP
 >>> result = af.solve_fte(problem, start)                        # doctest: +SKIP
@@ -36,6 +40,9 @@ _PUBLIC = {
     "initial_trajectory": "initialise",
     "SolveOptions": "solve",
     "solve_fte": "solve",
+    "EstimateOptions": "estimate",
+    "estimate_fte": "estimate",
+    "Assumptions": "problem",
     "FTEResult": "result",
     "Status": "result",
     "load_sequence": "data_tools.load",

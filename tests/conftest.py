@@ -1,5 +1,9 @@
 """What the tests of the core share: a small animal, cameras about it, and random problems."""
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the tests run side by side; read when NumPy is imported
+
 from dataclasses import replace
 
 import numpy as np
