@@ -272,6 +272,6 @@ def holdout_metrics(held: list[HeldOut]) -> dict[str, Any]:
 
     result = {}
     for key, field in (("heldout_px", "fitted"), ("heldout_nominal_px", "nominal")):
-        per_camera = {h.camera: scores([getattr(h, field)]) for h in held}
+        per_camera = {h.camera: {**scores([getattr(h, field)]), "status": h.status} for h in held}
         result[key] = {**scores([getattr(h, field) for h in held]), "per_camera": per_camera}
     return result

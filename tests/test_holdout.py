@@ -324,6 +324,7 @@ def test_scores_by_hand():
         "within_20px": 0.75,
         "coverage": 0.8,
         "n": 5,
+        "status": "converged",
     }
     pooled = found["heldout_nominal_px"]
     assert (pooled["n"], pooled["median"], pooled["coverage"]) == (11, 10.0, pytest.approx(10 / 11))

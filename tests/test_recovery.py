@@ -3,8 +3,8 @@
 Where a camera is can be told no better than the data allow. The Cramér–Rao bound for the cameras (the
 inverse of the information about them with the trajectory and all other parameters marginalised) says how
 well that is, and the tests ask for 3 mm and 0.05° where it is below that. A gallop past cameras beside its
-path is no such recording: all points lie along a line, from which a camera's pan is hard to tell from a
-step to the side.
+path is no such recording: all points lie along a line, from which a camera's tilt is hard to tell from a
+step up or down.
 
 Pictures and trajectory can turn, move and grow together; errors of the cameras are those that a similarity
 of the world does not explain.
