@@ -57,7 +57,7 @@ def estimate_noise(
     for term, found in condensed.evaluated():
         if term.term.family != "meas":
             continue
-        share = 0.0 if posterior is None else leverage(term, found, posterior.positions)
+        share = 0.0 if posterior is None else leverage(term, found, posterior)
         scaled = found.e * term.sd / np.sqrt(1.0 - share)
         for marker in np.unique(term.term.items[:, 0]):
             pools[marker].append(scaled[:, term.term.items[:, 0] == marker].ravel())

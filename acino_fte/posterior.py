@@ -57,6 +57,8 @@ class Posterior:
         Of θ.
     positions : (N, M, 3, 3)
         Of every marker, m².
+    with_cameras : (N, M, 3, P − K)
+        Of every marker and the parameters that are not those of the kinematics.
     log_determinant : float
         Of the objective's own Hessian for q and θ.
     exact : bool
@@ -69,6 +71,7 @@ class Posterior:
     cross: np.ndarray
     theta: np.ndarray
     positions: np.ndarray
+    with_cameras: np.ndarray
     log_determinant: float
     exact: bool
     data_weight: float = 1.0
@@ -103,7 +106,7 @@ def _posterior(problem: FTEProblem, minimum: Minimum, *, exact: bool) -> Posteri
     parts = condensed.hessian_parts(condensed.pack(minimum.q, minimum.theta))
     factor = factorise(problem, *parts, minimum.multipliers)
     first = _covariances(problem, condensed, minimum, factor)
-    weight = _data_weight(condensed, first.positions, exact=exact)
+    weight = _data_weight(condensed, first, exact=exact)
     sd = problem.parameters.sd
     scale = 2.0 * float(np.log(sd).sum())  # the determinant is that for θ, not for θ/σ
     scaled = factorise(problem, *_weighted(problem, minimum, parts, weight, exact), minimum.multipliers)
@@ -119,8 +122,8 @@ def _covariances(
     """What the inverse of a factored Hessian says, with its determinant for θ/σ_θ."""
     inverse, sd = factor.selected_inverse(), problem.parameters.sd
     cross, theta = inverse.cross * sd, inverse.corner * np.outer(sd, sd)
-    positions = _positions(problem, condensed, minimum, inverse.blocks[0], cross, theta)
-    return Posterior(inverse.blocks, cross, theta, positions, factor.log_determinant, condensed.exact)
+    markers = _markers(problem, minimum, inverse.blocks[0], cross, theta)
+    return Posterior(inverse.blocks, cross, theta, *markers, factor.log_determinant, condensed.exact)
 
 
 def _weighted(problem: FTEProblem, minimum: Minimum, parts: Parts, weight: float, exact: bool) -> Parts:
@@ -136,15 +139,15 @@ def _weighted(problem: FTEProblem, minimum: Minimum, parts: Parts, weight: float
     return blocks, border, corner
 
 
-def _data_weight(condensed: Condensed, positions: np.ndarray, *, exact: bool) -> float:
-    """w, from the residuals that ``condensed`` evaluated last and the covariance of the markers.
+def _data_weight(condensed: Condensed, spread: Posterior, *, exact: bool) -> float:
+    """w, from the residuals that ``condensed`` evaluated last and the covariance without it.
 
     The Hessian that is to be multiplied has E[ψ'], or Gauss–Newton's E[ψ/e].
     """
     total = np.zeros(3)
     for term, found in condensed.evaluated():
         if term.term.family == "meas":
-            free = 1.0 - leverage(term, found, positions)
+            free = 1.0 - leverage(term, found, spread)
             moments = _moments(term.term.loss, found.e / np.sqrt(free))
             total += (free * moments).sum(axis=(1, 2))
             gaussian = _moments(term.term.loss, _NODES) @ (_WEIGHTS / _WEIGHTS.sum())
@@ -162,14 +165,25 @@ def _moments(loss: Loss, e: np.ndarray) -> np.ndarray:
     return np.stack([bend, psi**2, weight])
 
 
-def leverage(term: CompiledTerm, found: Evaluation, positions: np.ndarray) -> np.ndarray:
+def leverage(term: CompiledTerm, found: Evaluation, spread: Posterior) -> np.ndarray:
     """v/σ² (c, K): variance of the predicted pixel over that of the detection, of every component.
 
-    ``positions`` (N, M, 3, 3) is the covariance of the markers.
+    Marker and camera count together: what is unsure of both together, as the frame of the world is, leaves
+    the pixel as it is. The marker of a late camera has the variance that it has at the frame.
     """
     slot = next(s for s in term.slots if s.kind == "position")
+    own = [s for s in term.slots if s.kind == "parameter"]
     slope = found.slope[:, slot.rows]
-    variance = np.einsum("cak,kab,cbk->ck", slope, positions[slot.frames, slot.items], slope, optimize=True)
+    covariance = spread.positions[slot.frames, slot.items]
+    variance = np.einsum("cak,kab,cbk->ck", slope, covariance, slope, optimize=True)
+    if own:
+        places = np.stack([s.items for s in own], axis=-1)  # (K, p)
+        turn = found.slope[:, [s.rows.start for s in own]]
+        first = len(spread.theta) - spread.with_cameras.shape[-1]
+        mixed = spread.with_cameras[slot.frames[:, None], slot.items[:, None], :, places - first]  # (K, p, 3)
+        variance += 2.0 * np.einsum("cak,kpa,cpk->ck", slope, mixed, turn, optimize=True)
+        cameras = spread.theta[places[:, :, None], places[:, None]]
+        variance += np.einsum("cpk,kpr,crk->ck", turn, cameras, turn, optimize=True)
     return np.clip(variance / term.sd**2, 0.0, MOST_LEVERAGE)
 
 
@@ -193,20 +207,16 @@ def factorise(
     return ArrowFactor(blocks, border * sd, corner)
 
 
-def _positions(
-    problem: FTEProblem,
-    condensed: Condensed,
-    minimum: Minimum,
-    q: np.ndarray,
-    cross: np.ndarray,
-    theta: np.ndarray,
-) -> np.ndarray:
-    """Covariance of the markers (N, M, 3, 3)."""
+def _markers(
+    problem: FTEProblem, minimum: Minimum, q: np.ndarray, cross: np.ndarray, theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the markers (N, M, 3, 3), and theirs with the other parameters (N, M, 3, P − K)."""
     linear = problem.kinematics.linearise(minimum.q, problem.proportions(minimum.theta))
-    jacobian = linear.jacobian  # (N, M, 3, Q)
+    jacobian, kinematic = linear.jacobian, problem.parameters.n_kinematic  # (N, M, 3, Q)
     result = (jacobian @ q[:, None]) @ jacobian.swapaxes(-1, -2)
+    with_cameras = jacobian @ cross[:, None, :, kinematic:]
     g = linear.growth.shape[-1]
-    for m in range(jacobian.shape[1] if problem.parameters.n_kinematic else 0):
+    for m in range(jacobian.shape[1] if kinematic else 0):
         own = np.arange(g + 3 * m, g + 3 * m + 3) if linear.rotations.shape[1] else np.empty(0, dtype=int)
         places = np.concatenate([np.arange(g), own])
         parts = [linear.growth[:, m]] + ([linear.rotations[:, m]] if len(own) else [])
@@ -214,4 +224,5 @@ def _positions(
         mixed = jacobian[:, m] @ cross[:, :, places] @ k.swapaxes(-1, -2)
         result[:, m] += mixed + mixed.swapaxes(-1, -2)
         result[:, m] += k @ theta[np.ix_(places, places)] @ k.swapaxes(-1, -2)
-    return result
+        with_cameras[:, m] += k @ theta[places, kinematic:]
+    return result, with_cameras
