@@ -10,14 +10,19 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from test_global_parameters import fitted
+from test_posterior import covariance
 from test_recovery import parameter_nees
 
+from acino_fte.condensed import Condensed
 from acino_fte.estimate import EstimateOptions, estimate_fte
 from acino_fte.losses import Loss
 from acino_fte.metrics_truth import ELLIPSOID, normalised_errors, truth_vectors
 from acino_fte.parameters import PriorWidths
+from acino_fte.posterior import MOST_LEVERAGE, leverage, posterior
 from acino_fte.problem import FTEOptions
 from acino_fte.simulate import SimulationOptions, simulate, simulation_to_sequence
+from acino_fte.solve import minimise
 
 WIDTH = 0.25  # of the joints' prior: at twice half a joint's range, as by default, draws leave the range
 
@@ -116,3 +121,35 @@ def test_a_gallop(cheetah, tuned):
     options = EstimateOptions(fit=(), tune_noise=tuned)
     found = scores(estimates(cheetah, options, range(2 if tuned else 5), noise_px="species"))
     assert found.holds(nees=(0.8, 1.2), coverage=(0.92, 0.98)), found
+
+
+@pytest.mark.parametrize("families", [(), ("scale", "offsets", "extrinsics")], ids="+".join)
+def test_leverage_is_the_variance_of_the_predicted_pixel(lizard, families):
+    """σ² times it, against finite differences of the residuals and the dense covariance of all unknowns.
+
+    With the cameras unsure too the pixels are surer than the markers by themselves would have them.
+    """
+    problem, x = fitted(lizard, families, Loss("squared"), n=5)
+    minimum = minimise(problem, Condensed(problem).unpack(x)[0])
+    spread = posterior(problem, minimum)
+    dense = covariance(problem, minimum)  # of (q, θ)
+    condensed = Condensed(problem)
+    packed = condensed.pack(minimum.q, minimum.theta)
+    unit = np.concatenate([np.ones(minimum.q.size), problem.parameters.sd])
+    slopes = []
+    for i in range(len(packed)):
+        step = 1e-6 * np.eye(len(packed))[i]
+        slopes.append((pixels(condensed, packed + step) - pixels(condensed, packed - step)) / 2e-6 / unit[i])
+    slopes = np.stack(slopes)
+    expected = np.einsum("ik,ij,jk->k", slopes, dense, slopes, optimize=True)
+    condensed.objective(packed)
+    measured = [(t, e) for t, e in condensed.evaluated() if t.term.family == "meas"]
+    found = np.concatenate([leverage(t, e, spread).ravel() for t, e in measured])
+    np.testing.assert_allclose(found, np.minimum(expected, MOST_LEVERAGE), rtol=1e-4)
+    assert found.max() < 1
+
+
+def pixels(condensed, x):
+    """Normalised residuals of all detections at x."""
+    condensed.objective(x)
+    return np.concatenate([e.e.ravel() for t, e in condensed.evaluated() if t.term.family == "meas"])

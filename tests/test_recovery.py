@@ -171,6 +171,7 @@ def test_everything_together_before_near_cameras(cheetah, seed):
     assert bound.millimetres < TARGET_MM / 1.5
     result = estimate_fte(sequence, cheetah, EstimateOptions(fit=FIT))
     assert result.status.ok
+    assert np.median(list(result.parameters["noise_px"].values())) == pytest.approx(1.0, rel=0.1)
     found = camera_errors(result, simulation)
     assert found.degrees <= TARGET_DEG
     assert found.millimetres <= TARGET_MM
@@ -208,6 +209,7 @@ def test_everything_together_of_a_gallop(cheetah):
         errors = result.metrics["parameter_errors"]
         assert errors["time_offset_ms"]["max"] <= 0.3
         assert errors["segment_scale"]["max"] <= 0.01
+        assert np.median(list(result.parameters["noise_px"].values())) == pytest.approx(2.0, rel=0.1)
         found = camera_errors(result, simulation)
         assert found.millimetres < 2.5 * bound.millimetres
         assert found.degrees < 2.5 * bound.degrees
