@@ -33,21 +33,20 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from acino_fte.baseline_tri import (
-    check_any,
     marker_sd,
     point_covariance,
     points_result,
     project_all,
     triangulation_covariance,
 )
-from acino_fte.cameras import Camera, CameraArray
+from acino_fte.cameras import CameraArray
 from acino_fte.losses import Loss
 from acino_fte.parameters import PriorWidths
 from acino_fte.problem import FTEOptions
 from acino_fte.result import FTEResult, Status
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton
-from acino_fte.triangulate import Triangulation, triangulate
+from acino_fte.triangulate import Triangulation, check_any, triangulate
 
 _WIDE = 60.0  # px: views agree within three times the usual distance while the cameras are not corrected
 _MAX_STEPS = 200
@@ -84,11 +83,11 @@ def estimate_sba(
     if cameras_too:  # once with every view that is near, so that the right ones agree afterwards
         near = triangulate(cameras, pixels, _WIDE)
         rough = Bundle(cameras, pixels, near, sd, Loss("cauchy"), poses, options.widths)
-        check_any(rough.known_points, sequence, options)
+        check_any(rough.known_points, sequence, options.likelihood)
         poses = rough.unpack(solve_bundle(rough, enough=1e-3).x)[1]
     start = triangulate(correct(cameras, poses), pixels)
     bundle = Bundle(cameras, pixels, start, sd, options.loss, poses if cameras_too else None, options.widths)
-    check_any(bundle.known_points, sequence, options)
+    check_any(bundle.known_points, sequence, options.likelihood)
     initialised = time.perf_counter()
     solution = solve_bundle(bundle, progress)
     points, poses = bundle.unpack(solution.x)
@@ -113,18 +112,12 @@ def estimate_sba(
 
 def correct(cameras: CameraArray, poses: np.ndarray) -> CameraArray:
     """Cameras with corrections (C, 6) of their poses: rotation vector ρ, rad, and translation d, m."""
+    turns = Rotation.from_rotvec(poses[:, :3]).as_matrix()
     return CameraArray(
         tuple(
-            _corrected(camera, pose) if pose.any() else camera
-            for camera, pose in zip(cameras, poses, strict=True)
+            camera.displaced(turn, pose[3:]) if pose.any() else camera
+            for camera, turn, pose in zip(cameras, turns, poses, strict=True)
         )
-    )
-
-
-def _corrected(camera: Camera, pose: np.ndarray) -> Camera:
-    turn = Rotation.from_rotvec(pose[:3]).as_matrix()
-    return replace(
-        camera, rotation=turn @ camera.rotation, translation=camera.translation @ turn.T + pose[3:]
     )
 
 

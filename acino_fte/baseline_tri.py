@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 
 from acino_fte.cameras import CameraArray
-from acino_fte.errors import InputError
 from acino_fte.losses import Loss
 from acino_fte.problem import FTEOptions
 from acino_fte.result import FTEResult, Status
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton
-from acino_fte.triangulate import Triangulation, triangulate
+from acino_fte.triangulate import Triangulation, check_any, triangulate
 
 
 def estimate_tri(
@@ -42,7 +41,7 @@ def estimate_tri(
     began = time.perf_counter()
     pixels = sequence.pixels(skeleton.marker_names, options.likelihood)
     found = triangulate(sequence.cameras, pixels)
-    check_any(found.points, sequence, options)
+    check_any(found.points, sequence, options.likelihood)
     return points_result(
         "tri",
         sequence,
@@ -97,17 +96,6 @@ def points_result(
         findings=() if known.all() else (found,),
         **more,
     )
-
-
-def check_any(points: np.ndarray, sequence: Sequence, options: FTEOptions) -> None:
-    """Raise InputError when there is no point at all."""
-    if not np.isfinite(points).any():
-        raise InputError(
-            f"No marker of sequence '{sequence.name}' is seen by two cameras at once with rays that meet.",
-            expected=f"likelihood above {options.likelihood:g} in two of {', '.join(sequence.cameras.names)}",
-            remedy="lower --likelihood, choose other frames, or check that each keypoint file belongs to "
-            "its camera",
-        )
 
 
 def marker_sd(skeleton: Skeleton) -> np.ndarray:

@@ -99,6 +99,13 @@ class Camera:
             translation=self.translation[frames] if self.translation.ndim == 2 else self.translation,
         )
 
+    def displaced(self, turn: np.ndarray, shift: np.ndarray) -> Camera:
+        """The camera after a correction in its own frame: x_camera = T (R x + t) + d.
+
+        ``turn`` (3, 3) is the rotation T, ``shift`` (3,) is d, m.
+        """
+        return replace(self, rotation=turn @ self.rotation, translation=self.translation @ turn.T + shift)
+
     def to_camera(self, points: np.ndarray) -> np.ndarray:
         """World points (N, M, 3) in the camera's frame; for a fixed camera any leading shape will do."""
         if not self.moves:

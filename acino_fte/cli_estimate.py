@@ -109,6 +109,7 @@ def load(source: Source, options: EstimateOptions) -> tuple[Sequence, Kinematics
     """The sequence, and the kinematics of its species; what SymPy must derive is derived here."""
     from acino_fte.data_tools.load import load_sequence
     from acino_fte.kinematics import load_kinematics
+    from acino_fte.parameters import FAMILIES, KINEMATIC
     from acino_fte.residuals import lower
     from acino_fte.skeleton import load_skeleton
     from acino_fte.terms import measurement_residual
@@ -122,8 +123,10 @@ def load(source: Source, options: EstimateOptions) -> tuple[Sequence, Kinematics
         likelihood=options.problem.likelihood,
     )
     kinematics = load_kinematics(load_skeleton(sequence.species))
-    fit = ("delay", "extrinsics", "scale") if options.fit is None else options.fit
-    kinematics.with_parameters(f for f in fit if f in ("scale", "offsets"))
+    fit = FAMILIES if options.fit is None else options.fit
+    kinematics.with_parameters(f for f in fit if f in KINEMATIC)
+    if options.fit is None:
+        kinematics.with_parameters(("scale",))  # what is fitted, as a rule, of what is looked at
     for model in {camera.model for camera in sequence.cameras}:
         lower(measurement_residual(model))  # derived now, the first time, and not while solving
         if fit:

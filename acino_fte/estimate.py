@@ -32,11 +32,10 @@ from acino_fte.noise import estimate_noise
 from acino_fte.observable import ORDER, observable
 from acino_fte.parameters import check_families, describe
 from acino_fte.posterior import Posterior, posterior
-from acino_fte.prediction import corrected_cameras, predict, time_offsets
 from acino_fte.problem import Assumptions, FTEOptions, FTEProblem, build_fte
 from acino_fte.result import FTEResult, Status
 from acino_fte.sequence import Sequence
-from acino_fte.solve import Minimum, Progress, SolveOptions, minimise, rates
+from acino_fte.solve import Minimum, Progress, SolveOptions, minimise, predicted_pixels, rates
 from acino_fte.terms import Term
 from acino_fte.tune import tune
 
@@ -161,6 +160,7 @@ class _Estimate:
         self.assignment: Assignment | None = None
         self.extra: tuple[Term, ...] = ()
         self.findings: list[str] = []
+        self.contacts: list[str] = []
         self.iterations = 0
         self.q = np.empty(0)
         self.theta = np.empty(0)
@@ -238,7 +238,7 @@ class _Estimate:
                 problem = self._problem()
             self._measure(problem, minimum, spread)
         if self.options.contact:
-            positions = problem.kinematics.positions(minimum.q, problem.proportions(minimum.theta))
+            positions = problem.positions(minimum.q, minimum.theta)
             terms, self.contacts = contact_terms(problem, positions, self.sequence)
             self.extra = tuple(terms)
         return changed
@@ -256,7 +256,7 @@ class _Estimate:
         self.assignment = resolve(
             self.skeleton,
             self.detected,
-            self._predicted(problem, minimum),
+            predicted_pixels(problem, minimum),
             np.asarray(self.assumed.sd_px),
             self.options.problem.loss,
             candidates=self.sequence.candidates(names, threshold),
@@ -269,16 +269,24 @@ class _Estimate:
 
     def _choose(self) -> None:
         """Which parameters to fit: those asked for, or those that the data can tell."""
-        judged = observable(self.sequence, self.kinematics, self.options.problem, self.assumed, self.q, ORDER)
-        if self.options.fit is None:
+        asked = self.options.fit
+        judged = observable(
+            self.sequence,
+            self.kinematics,
+            self.options.problem,
+            self.assumed,
+            self.q,
+            ORDER if asked is None else asked,
+        )
+        if asked is None:
             self.fit = check_families(j.family for j in judged if j.full)
             self.findings += [j.reason for j in judged]
             return
-        self.fit = self.options.fit
+        self.fit = asked
         self.findings += [
             f"fitted because asked for, though {j.reason.split(': ', 1)[1]}: {j.family}"
             for j in judged
-            if j.family in self.fit and not j.full
+            if not j.full
         ]
 
     def _posterior(self, problem: FTEProblem, minimum: Minimum) -> Posterior | None:
@@ -305,16 +313,9 @@ class _Estimate:
 
     # --- the result --------------------------------------------------------------------------------
 
-    def _predicted(self, problem: FTEProblem, minimum: Minimum) -> np.ndarray:
-        """Pixels (N, C, M, 2) that the cameras should see."""
-        positions = problem.kinematics.positions(minimum.q, problem.proportions(minimum.theta))
-        cameras = corrected_cameras(self.sequence.cameras, problem.parameters, minimum.theta)
-        offsets = time_offsets(cameras, problem.parameters, minimum.theta)
-        return predict(cameras, positions, offsets, problem.dt)
-
     def _result(self, problem: FTEProblem, minimum: Minimum, spread: Posterior | None) -> FTEResult:
         velocity, acceleration = rates(minimum.q, problem.dt)
-        observed, predicted = np.asarray(self.assumed.pixels), self._predicted(problem, minimum)
+        observed, predicted = np.asarray(self.assumed.pixels), predicted_pixels(problem, minimum)
         sd = np.asarray(self.assumed.sd_px)
         return FTEResult(
             status=minimum.status,
@@ -323,7 +324,7 @@ class _Estimate:
             q=minimum.q,
             dq=velocity,
             ddq=acceleration,
-            positions=problem.kinematics.positions(minimum.q, problem.proportions(minimum.theta)),
+            positions=problem.positions(minimum.q, minimum.theta),
             observed=observed,
             reprojected=predicted,
             objective=minimum.objective,
@@ -370,6 +371,4 @@ class _Estimate:
         found = list(self.findings)
         if self.assignment is not None:
             found += self.assignment.findings(cameras, frames, self.skeleton)
-        if self.options.contact:
-            found += self.contacts
-        return found + diagnose(observed, predicted, self.sequence.fps, cameras, frames, sd)
+        return found + self.contacts + diagnose(observed, predicted, self.sequence.fps, cameras, frames, sd)

@@ -13,11 +13,12 @@ from acino_fte.estimate import EstimateOptions, estimate_fte
 from acino_fte.holdout import CAMERA_FAMILIES, hold_out, holdout_metrics
 from acino_fte.kinematics import Kinematics
 from acino_fte.methods import estimate
+from acino_fte.observable import ORDER
+from acino_fte.parameters import FAMILY_KEYS
 from acino_fte.result import FTEResult
 from acino_fte.sequence import Sequence
 from acino_fte.solve import Progress
 
-RUNGS = ("delay", "scale", "extrinsics", "offsets")
 _KEYS = ("median", "p90", "within_20px", "coverage")
 
 
@@ -43,13 +44,8 @@ def evaluate_holdout(
 
 def fitted_families(result: FTEResult) -> tuple[str, ...]:
     """Families of parameters that a result has."""
-    keys = {
-        "delay": "time_offset_s",
-        "scale": "segment_scale",
-        "extrinsics": "extrinsics",
-        "offsets": "marker_offset_m",
-    }
-    return tuple(family for family in RUNGS if keys[family] in result.parameters)
+    found = {family for key, family in FAMILY_KEYS.items() if key in result.parameters}
+    return tuple(family for family in ORDER if family in found)
 
 
 def climb(

@@ -83,8 +83,7 @@ class _Point:
         if len(x) > 2:
             ddx[:2] = ddx[2]
             dx[0] = dx[1] - problem.dt * ddx[1]
-        positions = problem.kinematics.positions(x, problem.proportions(theta))
-        return cls(x, dx, ddx, positions, theta)
+        return cls(x, dx, ddx, problem.positions(x, theta), theta)
 
     def residuals(self, problem: FTEProblem, term: Term) -> np.ndarray:
         """Residuals of a term at this point, (components, K)."""

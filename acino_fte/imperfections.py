@@ -112,12 +112,7 @@ def _corrected(camera: Camera, turn: np.ndarray, shift: np.ndarray) -> Camera:
 
     if not (np.any(turn) or np.any(shift)):
         return camera
-    rotation = Rotation.from_rotvec(turn).as_matrix()
-    return replace(
-        camera,
-        rotation=rotation @ camera.rotation,
-        translation=camera.translation @ rotation.T + shift,
-    )
+    return camera.displaced(Rotation.from_rotvec(turn).as_matrix(), shift)
 
 
 def _inverse(turn: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

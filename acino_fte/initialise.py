@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from acino_fte.errors import InputError
 from acino_fte.kinematics import Kinematics
 from acino_fte.losses import Loss
 from acino_fte.problem import FTEOptions, build_problem
@@ -16,7 +15,7 @@ from acino_fte.result import Status
 from acino_fte.sequence import Sequence
 from acino_fte.solve import SolveOptions, minimise
 from acino_fte.terms import point_term
-from acino_fte.triangulate import triangulate
+from acino_fte.triangulate import check_any, triangulate
 
 _POINT_SD = 0.06  # m, spread of triangulated markers about the skeleton: segment lengths are generic
 _ENOUGH = 3e-3  # relative decrease of the objective per iteration below which the start is good enough
@@ -41,13 +40,7 @@ def initial_trajectory(
         points = triangulate(cameras, pixels[some]).points
         if np.isfinite(points).any():
             break
-    else:
-        raise InputError(
-            f"No marker of sequence '{sequence.name}' is seen by two cameras at once with rays that meet.",
-            expected=f"likelihood above {options.likelihood:g} in two of {', '.join(sequence.cameras.names)}",
-            remedy="lower --likelihood, choose other frames, or check that each keypoint file belongs to "
-            "its camera",
-        )
+    check_any(points, sequence, options.likelihood)
     q = smooth_inverse_kinematics(kinematics, points, sequence.fps / stride, sequence.frames[some], options)
     if stride > 1:
         q = CubicSpline(np.arange(0, sequence.n_frames, stride), q, axis=0)(np.arange(sequence.n_frames))

@@ -83,13 +83,15 @@ def pose_errors(found: Mapping[str, Any], true: Mapping[str, Any]) -> dict[str, 
     angle of ``Exp(ω̂) Exp(ω)ᵀ`` and the centre by the length of ``Exp(ω̂)ᵀ τ̂ − Exp(ω)ᵀ τ``, whatever the
     nominal pose.
     """
+    from scipy.spatial.transform import Rotation
+
     centres, angles = [], []
     for camera in {**found, **true}:
         if not (_any(found.get(camera)) or _any(true.get(camera))):
             continue
         (turn, centre), (true_turn, true_centre) = (_moved(side.get(camera)) for side in (found, true))
         centres.append(1e3 * float(np.linalg.norm(centre - true_centre)))
-        angles.append(math.degrees(_angle(turn @ true_turn.T)))
+        angles.append(math.degrees(Rotation.from_matrix(turn @ true_turn.T).magnitude()))
     return {"position_mm": summarise_errors(centres), "rotation_deg": summarise_errors(angles)}
 
 
@@ -100,24 +102,8 @@ def _any(correction: Mapping[str, Any] | None) -> bool:
 
 def _moved(correction: Mapping[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) of a correction, and minus its shift of the camera's centre (3,), m, camera frame."""
+    from scipy.spatial.transform import Rotation
+
     correction = correction or {}
-    turn = rotation_matrix(np.asarray(correction.get("rotation_rad", np.zeros(3)), dtype=float))
+    turn = Rotation.from_rotvec(correction.get("rotation_rad", np.zeros(3))).as_matrix()
     return turn, turn.T @ np.asarray(correction.get("translation_m", np.zeros(3)), dtype=float)
-
-
-def rotation_matrix(vector: np.ndarray) -> np.ndarray:
-    """Exp: matrix (3, 3) of a rotation vector (3,), rad, by Rodrigues' formula."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    # sin(a)/a and (1 − cos a)/a², as sinc, which is defined at 0
-    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    return np.eye(3) + first * cross + second * cross @ cross
-
-
-def _angle(rotation: np.ndarray) -> float:
-    """Angle of a rotation matrix, rad; exact for small angles too."""
-    sine = 0.5 * math.hypot(
-        rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]
-    )
-    return math.atan2(sine, 0.5 * (float(np.trace(rotation)) - 1.0))

@@ -203,7 +203,7 @@ def describe(
     Scales are factors, with the standard deviation s·sd(λ). The ``reference`` camera is listed with zeros.
     """
     result: dict[str, Any] = {}
-    for name, family in _FAMILY_KEYS.items():
+    for name, family in FAMILY_KEYS.items():
         if family not in parameters.families:
             continue
         zero = _ZEROS.get(family) if reference else None
@@ -239,7 +239,7 @@ def _table(parameters: Parameters, family: str, values: np.ndarray) -> dict[str,
     return table
 
 
-_FAMILY_KEYS = {
+FAMILY_KEYS = {
     "segment_scale": "scale",
     "marker_offset_m": "offsets",
     "time_offset_s": "delay",

@@ -6,7 +6,6 @@ Shapes: N frames, C cameras, M markers.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -17,10 +16,7 @@ from acino_fte.parameters import POSE, Parameters, cayley_matrix
 
 def corrected(camera: Camera, correction: np.ndarray) -> Camera:
     """The camera after a correction (ρ, d) (6,): x_camera = C(ρ)(R x + t) + d, by Cayley's rotation C."""
-    turn = cayley_matrix(correction[:3])
-    return replace(
-        camera, rotation=turn @ camera.rotation, translation=camera.translation @ turn.T + correction[3:]
-    )
+    return camera.displaced(cayley_matrix(correction[:3]), correction[3:])
 
 
 def corrected_cameras(cameras: CameraArray, parameters: Parameters, theta: np.ndarray) -> CameraArray:

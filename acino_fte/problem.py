@@ -147,6 +147,10 @@ class FTEProblem:
         """The part of θ that the kinematics take."""
         return theta[: self.parameters.n_kinematic] if self.kinematics.n_parameters else None
 
+    def positions(self, q: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        """Marker positions (N, M, 3), m, at q (N, Q) and θ (P,)."""
+        return self.kinematics.positions(q, self.proportions(theta))
+
     def with_terms(self, *terms: Term) -> FTEProblem:
         """The same problem with more terms."""
         return replace(self, terms=(*self.terms, *terms))

@@ -307,10 +307,7 @@ def solve_fte(
         raise InputError(
             f"There is no lowering '{lowering}'.", key="lowering", expected="'condensed' or 'explicit'"
         )
-    positions = problem.kinematics.positions(minimum.q, problem.proportions(minimum.theta))
     velocity, acceleration = rates(minimum.q, problem.dt)
-    cameras = corrected_cameras(problem.sequence.cameras, problem.parameters, minimum.theta)
-    late = time_offsets(cameras, problem.parameters, minimum.theta)
     return FTEResult(
         status=minimum.status,
         sequence=problem.sequence,
@@ -318,18 +315,26 @@ def solve_fte(
         q=minimum.q,
         dq=velocity,
         ddq=acceleration,
-        positions=positions,
+        positions=problem.positions(minimum.q, minimum.theta),
         observed=problem.sequence.pixels(
             problem.kinematics.skeleton.marker_names, problem.options.likelihood
         ),
-        reprojected=predict(cameras, positions, late, problem.dt),
+        reprojected=predicted_pixels(problem, minimum),
         objective=minimum.objective,
         iterations=minimum.iterations,
         method=f"fte-{lowering}",
         seconds={**(seconds or {}), "solve": time.perf_counter() - began},
         options={"problem": problem.options.summary(), "solver": options.summary()},
-        parameters=describe(problem.parameters, minimum.theta, None, cameras.names[0]),
+        parameters=describe(problem.parameters, minimum.theta, None, problem.sequence.cameras.names[0]),
     )
+
+
+def predicted_pixels(problem: FTEProblem, minimum: Minimum) -> np.ndarray:
+    """Pixels (N, C, M, 2) that the cameras of a problem's sequence should see, NaN behind them."""
+    assert problem.sequence is not None
+    cameras = corrected_cameras(problem.sequence.cameras, problem.parameters, minimum.theta)
+    late = time_offsets(cameras, problem.parameters, minimum.theta)
+    return predict(cameras, problem.positions(minimum.q, minimum.theta), late, problem.dt)
 
 
 def rates(q: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:

@@ -10,10 +10,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from acino_fte.cameras import CameraArray
+from acino_fte.errors import InputError
+
+if TYPE_CHECKING:
+    from acino_fte.sequence import Sequence
 
 _MAX_PAIRS = 36
 _CHUNK = 4096
@@ -191,3 +196,14 @@ def _refine(views: _Views, rows: np.ndarray, points: np.ndarray, threshold: floa
     right = flat_w.transpose(0, 2, 1) @ residual.reshape(k, -1, 1)
     normal += 1e-9 * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(3)
     return points - np.linalg.solve(normal, right)[..., 0]
+
+
+def check_any(points: np.ndarray, sequence: Sequence, likelihood: float) -> None:
+    """Raise InputError when there is no point at all."""
+    if not np.isfinite(points).any():
+        raise InputError(
+            f"No marker of sequence '{sequence.name}' is seen by two cameras at once with rays that meet.",
+            expected=f"likelihood above {likelihood:g} in two of {', '.join(sequence.cameras.names)}",
+            remedy="lower --likelihood, choose other frames, or check that each keypoint file belongs to "
+            "its camera",
+        )
