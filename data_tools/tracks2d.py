@@ -6,7 +6,7 @@ is a bare point (track −1). Shapes: P rows of one camera, N frames, C cameras.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,6 +42,11 @@ class Tracks2D:
         The true animal, −1 for clutter; used for scoring only.
     path : Path, optional
         The file, for messages.
+    row : (P,) int
+        Row of the file that the dot comes from, from 0; by default 0, 1, …. Rows of a file that holds all
+        cameras are counted over all of them.
+    left_out : pandas.DataFrame, optional
+        Rows of the file without a dot (no coordinates): columns row, frame, track (the label, or empty).
     """
 
     camera: str
@@ -51,6 +56,12 @@ class Tracks2D:
     labels: tuple[str, ...]
     animal: np.ndarray | None = None
     path: Path | None = None
+    row: np.ndarray = field(default=None)  # type: ignore[arg-type]
+    left_out: pd.DataFrame | None = None
+
+    def __post_init__(self) -> None:
+        if self.row is None:
+            object.__setattr__(self, "row", np.arange(len(self.frame)))
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -58,6 +69,17 @@ class Tracks2D:
     def without_tracks(self) -> Tracks2D:
         """The same dots as bare points."""
         return replace(self, track=np.full(len(self), BARE), labels=())
+
+    def at_rows(self, rows: np.ndarray) -> Tracks2D:
+        """The dots that an index or a mask (P,) picks; the labels all stay."""
+        return replace(
+            self,
+            frame=self.frame[rows],
+            track=self.track[rows],
+            xy=self.xy[rows],
+            animal=None if self.animal is None else self.animal[rows],
+            row=self.row[rows],
+        )
 
 
 @dataclass(frozen=True, eq=False)
