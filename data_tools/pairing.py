@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acino_fte.cameras import CameraArray
+from acino_fte.data_tools.epipolar import essential_from_poses, sampson_distance
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -112,28 +113,19 @@ class _Prices:
         self._essential = cache(self._essential_matrix)
 
     def _undistorted(self, camera: int, file: int) -> np.ndarray:
-        """(N, M, 3) homogeneous normalised coordinates of a file seen through a camera."""
-        flat = self._cameras[camera].undistort(self._pixels[:, file])
-        return np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], axis=-1)
+        """(N, M, 2) normalised coordinates of a file seen through a camera."""
+        return self._cameras[camera].undistort(self._pixels[:, file])
 
     def _essential_matrix(self, a: int, b: int) -> np.ndarray:
         """(N or 1, 3, 3) with x_b · E x_a = 0; NaN where the two centres coincide."""
-        relative = self._rotation[:, b] @ np.swapaxes(self._rotation[:, a], 1, 2)
-        shift = self._translation[:, b] - np.einsum("nij,nj->ni", relative, self._translation[:, a])
-        length = np.linalg.norm(shift, axis=-1, keepdims=True)
-        x, y, z = np.moveaxis(shift / np.where(length > 1e-9, length, np.nan), -1, 0)
-        zero = np.zeros_like(x)
-        cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
-        return cross @ relative
+        return essential_from_poses(
+            self._rotation[:, a], self._translation[:, a], self._rotation[:, b], self._translation[:, b]
+        )
 
     def __call__(self, a: int, file_a: int, b: int, file_b: int) -> float:
         """Price of cameras a and b with the given files."""
-        x_a, x_b, essential = self._rays(a, file_a), self._rays(b, file_b), self._essential(a, b)
-        line_b = x_a @ np.swapaxes(essential, 1, 2)
-        line_a = x_b @ essential
-        slope = line_b[..., 0] ** 2 + line_b[..., 1] ** 2 + line_a[..., 0] ** 2 + line_a[..., 1] ** 2
-        with np.errstate(invalid="ignore", divide="ignore"):
-            distance = np.abs((line_b * x_b).sum(-1)) / np.sqrt(slope)
+        essential = self._essential(a, b)[:, None]
+        distance = np.abs(sampson_distance(essential, self._rays(a, file_a), self._rays(b, file_b)))
         distance = distance[np.isfinite(distance)]
         if len(distance) < _FEWEST:
             return float("nan")
