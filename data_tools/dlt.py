@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from acino_fte.cameras import CameraArray
-from acino_fte.data_tools.calibration import UNITS
+from acino_fte.data_tools.calibration import UNITS, _with_file
 from acino_fte.data_tools.projective_camera import ProjectiveCamera
 from acino_fte.errors import InputError
 
@@ -84,14 +84,7 @@ def read_dlt(
                 f"cam{i + 1}", column, size, image_height=size[1], metres=UNITS[unit]
             )
         except InputError as error:
-            raise InputError(
-                error.problem,
-                file=path,
-                key=f"column {i + 1}",
-                expected=error.expected,
-                found=error.found,
-                remedy=error.remedy,
-            ) from None
+            raise _with_file(error, path, f"column {i + 1}") from None
         cameras.append(camera)
     return CameraArray(tuple(cameras))
 
@@ -104,7 +97,13 @@ def _sizes(
     profile: Path | str | None,
 ) -> list[Resolution]:
     """Width and height of every camera's images, px."""
-    if resolution is None and profile is None:
+    if resolution is not None:
+        sizes = np.array(resolution, dtype=float)
+        if sizes.shape == (2,):
+            sizes = np.tile(sizes, (n_cameras, 1))
+    elif profile is not None:
+        sizes = _profile_sizes(Path(profile), n_cameras, checked=image_height is None)
+    else:
         raise InputError(
             "DLT coefficients do not say how large the images are.",
             file=path,
@@ -113,13 +112,6 @@ def _sizes(
             found="none" if image_height is None else f"a height of {image_height} px and no width",
             remedy=_HOW,
         )
-    if resolution is None:
-        assert profile is not None
-        sizes = _profile_sizes(Path(profile), n_cameras, checked=image_height is None)
-    else:
-        sizes = np.array(resolution, dtype=float)
-        if sizes.shape == (2,):
-            sizes = np.tile(sizes, (n_cameras, 1))
     if image_height is not None and sizes.ndim == 2:
         sizes[:, 1:2] = image_height
     if sizes.shape != (n_cameras, 2) or not (np.isfinite(sizes).all() and sizes.min() >= 1):

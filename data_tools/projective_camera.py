@@ -259,7 +259,8 @@ class ProjectiveCamera(Camera):
         ideal = np.asarray(pixels, dtype=float) if self.radial is None else self.radial.ideal(pixels)
         fx, fy, cx, cy, skew = self.parameters[:5]
         b = (ideal[..., 1] - cy) / fy
-        return np.stack([(ideal[..., 0] - cx - skew * b) / fx, b], axis=-1)
+        a = (ideal[..., 0] - cx - skew * b) / fx
+        return np.stack([a + 0 * b, b + 0 * a], axis=-1)  # half a pixel is none
 
     def _run(self, program: str, local: np.ndarray, n_out: int) -> np.ndarray:
         """Pixels, and for "jacobian" their slopes, of camera-frame points (…, 3); NaN for z ≤ 0."""

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from acino_fte.cameras import Camera, CameraArray
-from acino_fte.data_tools.calibration import _camera, _validated, read_cameras
+from acino_fte.data_tools.calibration import _camera, _validated, _with_file, read_cameras
 from acino_fte.data_tools.dlt import Resolution, read_dlt
 from acino_fte.data_tools.projective_camera import ProjectiveCamera, ViconRadial
 from acino_fte.data_tools.vicon import read_xcp
@@ -127,14 +127,17 @@ def _selected(cameras: CameraArray, only: Sequence[str | int], path: Path) -> Ca
     for name in names:
         if name not in cameras.names:
             raise InputError(
-                f"The file has no camera '{name}'{did_you_mean(name, cameras.names)}",
+                f"The file has no camera '{name}'{did_you_mean(name, cameras.names) or '.'}",
                 file=path,
                 key="only",
                 expected=", ".join(cameras.names),
                 found=name,
                 remedy="choose cameras of the file",
             )
-    return CameraArray(tuple(cameras[name] for name in names))
+    try:
+        return CameraArray(tuple(cameras[name] for name in names))
+    except InputError as error:
+        raise _with_file(error, path, "only") from None
 
 
 def _scene_entries(path: Path) -> tuple[list[Any], str] | None:
@@ -165,9 +168,7 @@ def _read_scene(path: Path, entries: list, prefix: str, unit: str) -> CameraArra
     try:
         return CameraArray(tuple(cameras))
     except InputError as error:
-        raise InputError(
-            error.problem, file=path, key=f"{prefix}id", found=error.found, remedy=error.remedy
-        ) from None
+        raise _with_file(error, path, f"{prefix}id") from None
 
 
 def _scene_camera(data: Any, place: str, unit: str, path: Path) -> Camera:
@@ -194,14 +195,7 @@ def _scene_camera(data: Any, place: str, unit: str, path: Path) -> Camera:
             return _projective(camera, skew, radial, place)
     except InputError as error:
         key = (error.key or "").rpartition(".")[2]
-        raise InputError(
-            error.problem,
-            file=path,
-            key=f"{place}.{_KEYS.get(key, key)}",
-            expected=error.expected,
-            found=error.found,
-            remedy=error.remedy,
-        ) from None
+        raise _with_file(error, path, f"{place}.{_KEYS.get(key, key)}") from None
     return camera
 
 

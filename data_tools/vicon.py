@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from acino_fte.cameras import CameraArray
+from acino_fte.data_tools.calibration import _with_file
 from acino_fte.data_tools.projective_camera import ProjectiveCamera, ViconRadial
 from acino_fte.errors import InputError, did_you_mean
 
@@ -65,7 +66,11 @@ def read_xcp(path: Path | str, only: Sequence[str | int] | None = None) -> Camer
             found=f"{len(elements)} cameras, none of them calibrated" if elements else "no Camera element",
             remedy="calibrate the cameras and save the file again",
         )
-    return CameraArray(tuple(_camera(element, path) for element in chosen))
+    cameras = tuple(_camera(element, path) for element in chosen)
+    try:
+        return CameraArray(cameras)
+    except InputError as error:
+        raise _with_file(error, path, "DEVICEID") from None
 
 
 def _root(path: Path) -> ElementTree.Element:
@@ -104,7 +109,7 @@ def _named(elements: list[ElementTree.Element], wanted: str, path: Path) -> Elem
     devices = [e.get("DEVICEID", "") for e in elements]
     listed = ", ".join(devices[:8]) + (", …" if len(devices) > 8 else "")
     raise InputError(
-        f"The Vicon file has no camera '{wanted}'{did_you_mean(wanted, devices)}",
+        f"The Vicon file has no camera '{wanted}'{did_you_mean(wanted, devices) or '.'}",
         file=path,
         key="only",
         expected=f"a DEVICEID ({listed}) or a unique USERID",
