@@ -7,6 +7,7 @@ are passed over. Names of columns are matched without regard to case, and a few 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,12 +68,18 @@ def read_joint_table(path: Path | str) -> dict[str, Tracks2D]:
         Tracks2D by what the column cam has, as text, in the order of first appearance. The index of rows is
         that of the whole file.
     """
+    import pandas as pd
+
     path = Path(path)
     table = read_table(path, required=("frame", "cam", "x", "y"), optional=("track", "animal"))
     names = labels(table["cam"])
     if (missing := names.isna()).any():
         raise row_error(path, "cam", int(np.argmax(missing)), "the name of a camera", "nothing")
-    return {str(name): _tracks(table[(names == name).to_numpy()], str(name), path) for name in names.unique()}
+    rows, codes = np.arange(len(table)), pd.factorize(names)[0]
+    return {
+        str(name): _tracks(table[codes == i], str(name), path, rows[codes == i])
+        for i, name in enumerate(names.unique())
+    }
 
 
 def has_camera_column(path: Path) -> bool:
@@ -84,7 +91,7 @@ def has_camera_column(path: Path) -> bool:
     return {"cam", "x", "y"} <= found
 
 
-def read_true_animals(path: Path | str, n_rows: int) -> np.ndarray:
+def read_true_animals(path: Path | str, n_rows: int, rows: np.ndarray | None = None) -> np.ndarray:
     """Read the true animal of every row of a track table.
 
     Parameters
@@ -93,10 +100,12 @@ def read_true_animals(path: Path | str, n_rows: int) -> np.ndarray:
         Table with a column animal; −1 or nothing is clutter. Rows are those of the track table.
     n_rows : int
         Rows of the track table.
+    rows : (P,) int, optional
+        The rows that are wanted; by default all.
 
     Returns
     -------
-    (n_rows,) int
+    (P,) int
 
     Raises
     ------
@@ -104,7 +113,10 @@ def read_true_animals(path: Path | str, n_rows: int) -> np.ndarray:
         The number of rows is another, or an animal is no whole number.
     """
     path = Path(path)
-    animal = animals(read_table(path, required=("animal",))["animal"], path)
+    column = read_table(path, required=("animal",))["animal"]
+    if column.iloc[n_rows:].isna().all():
+        column = column.iloc[:n_rows]  # blank lines at the end
+    animal = animals(column, path)
     if len(animal) != n_rows:
         raise InputError(
             "The truth does not belong to the tracks: its rows are those of the track file, one for one.",
@@ -113,7 +125,7 @@ def read_true_animals(path: Path | str, n_rows: int) -> np.ndarray:
             found=f"{len(animal)} rows",
             remedy="write both files again from one source, or move the truth away: it is for scoring only",
         )
-    return animal
+    return animal if rows is None else animal[rows]
 
 
 def read_truth_3d(path: Path | str) -> pd.DataFrame:
@@ -210,8 +222,46 @@ def tracks_from_columns(
     return view
 
 
-def _tracks(table: pd.DataFrame, camera: str, path: Path) -> Tracks2D:
-    """The dots of one camera out of a table whose index is the row of the file."""
+def tracks_from_grid(
+    camera: str,
+    xy: np.ndarray,
+    names: Sequence[str],
+    *,
+    path: Path,
+    animal: np.ndarray | None = None,
+    first_frame: int = 0,
+) -> Tracks2D:
+    """Dots and tracks of one camera from positions on a grid of frames and animals.
+
+    Parameters
+    ----------
+    camera : str
+        Its name.
+    xy : (F, A, 2)
+        Pixels, y from the top; not finite where there is no dot.
+    names : sequence of str
+        Of the A tracks.
+    path : Path
+        For messages.
+    animal : (A,) int, optional
+        The true animals.
+    first_frame : int
+        Frame of the first row.
+    """
+    frame, place = np.nonzero(np.isfinite(xy).all(-1))
+    return Tracks2D(
+        camera=camera,
+        frame=frame + first_frame,
+        track=place,
+        xy=np.ascontiguousarray(xy[frame, place], dtype=float),
+        labels=tuple(str(name) for name in names),
+        animal=None if animal is None else np.asarray(animal)[place],
+        path=path,
+    )
+
+
+def _tracks(table: pd.DataFrame, camera: str, path: Path, row: np.ndarray | None = None) -> Tracks2D:
+    """The dots of one camera out of a table."""
     animal = animals(table["animal"], path) if "animal" in table else None
     if "track" in table:
         label = table["track"]
@@ -226,7 +276,7 @@ def _tracks(table: pd.DataFrame, camera: str, path: Path) -> Tracks2D:
         np.stack([numbers(table["x"], "x", path), numbers(table["y"], "y", path)], axis=1),
         path=path,
         animal=animal,
-        row=table.index.to_numpy(),
+        row=row,
     )
 
 

@@ -56,9 +56,6 @@ def cameras_of(stem: str, cameras: Sequence[str]) -> list[str]:
     ]
 
 
-def join_by_place(names: Iterable[str], n_cameras: int) -> dict[str, int] | None:
-    """Places of cameras when the names are the numbers 0, 1, … or 1, 2, …, one for each; else nothing."""
-    names = list(names)
-    if sorted(names, key=lambda n: (len(n), n)) == [str(i) for i in range(n_cameras)]:
-        return {name: int(name) for name in names}
-    return None
+def counted(names: Iterable[str], n_cameras: int) -> bool:
+    """Whether the names are the numbers 0, 1, … of all cameras: then they count places, and name nothing."""
+    return sorted(names) == sorted(str(i) for i in range(n_cameras))

@@ -5,6 +5,7 @@ A message about a value counts rows as the file does: after the header, from 1, 
 
 from __future__ import annotations
 
+import csv
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,17 +42,44 @@ def read_table(path: Path, *, required: Sequence[str], optional: Sequence[str] =
         if name not in found:
             raise _missing_column(path, name, header)
     columns = {found[name]: name for name in (*required, *optional) if name in found}
+    table = _parse(path, header, sep=separator, usecols=list(columns), skip_blank_lines=False)
+    table.columns = pd.Index([columns[str(name)] for name in table.columns])
+    filled = np.flatnonzero(table.notna().any(axis=1))
+    if len(required) > 1:
+        table = table.iloc[filled]  # blank lines are no dots
+    return table
+
+
+def read_all(path: Path) -> pd.DataFrame:
+    """All columns of a table as they are."""
+    header, separator = read_header(path)
+    return _parse(path, header, sep=separator)
+
+
+def read_wide(path: Path, *, infinite: bool = False) -> tuple[list[str], np.ndarray]:
+    """All columns of a table of numbers: their names and (F, columns), NaN where a cell is empty.
+
+    With ``infinite``, infinite values are allowed.
+    """
+    header, table = read_header(path)[0], read_all(path)
+    columns = [numbers(table.iloc[:, i], name, path, infinite) for i, name in enumerate(header)]
+    return header, np.stack(columns, axis=1)
+
+
+def _parse(path: Path, header: Sequence[str], **options: Any) -> pd.DataFrame:
+    import pandas as pd
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            table = pd.read_csv(
+            return pd.read_csv(
                 path,
-                sep=separator,
-                usecols=list(columns),
+                names=[f"{name}.{i}" if name in header[:i] else name for i, name in enumerate(header)],
+                header=0,
                 index_col=False,
                 encoding="utf-8-sig",
                 low_memory=False,
-                skip_blank_lines=False,
+                **options,
             )
     except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError, ValueError) as error:
         raise InputError(
@@ -61,11 +89,6 @@ def read_table(path: Path, *, required: Sequence[str], optional: Sequence[str] =
             found=str(error).splitlines()[0],
             remedy="write the file again; it was cut, or edited by hand",
         ) from None
-    table.columns = pd.Index([columns[str(name)] for name in table.columns])
-    filled = np.flatnonzero(table.notna().any(axis=1))
-    if len(required) > 1:
-        table = table.iloc[filled]  # blank lines are no dots
-    return table
 
 
 def read_header(path: Path) -> tuple[list[str], str]:
@@ -91,7 +114,7 @@ def read_header(path: Path) -> tuple[list[str], str]:
             remedy="check the path",
         )
     separator = max(_SEPARATORS, key=line.count)
-    return [name.strip().strip('"') for name in line.rstrip("\r\n").split(separator)], separator
+    return [name.strip() for name in next(csv.reader([line], delimiter=separator))], separator
 
 
 def _no_text(path: Path) -> InputError:
@@ -120,7 +143,7 @@ def _missing_column(path: Path, name: str, header: Sequence[str]) -> InputError:
     numbers = all(natural_order(cell)[0] == 0 for cell in header)
     near = did_you_mean(name, (cell for cell in header if len(cell) > 1))
     return InputError(
-        f"The table has no column '{name}'{near}.",
+        f"The table has no column '{name}'{near or '.'}",
         file=path,
         key="header",
         expected=", ".join((name, *SYNONYMS[name])),
@@ -129,7 +152,7 @@ def _missing_column(path: Path, name: str, header: Sequence[str]) -> InputError:
     )
 
 
-def numbers(column: pd.Series, name: str, path: Path) -> np.ndarray:
+def numbers(column: pd.Series, name: str, path: Path, infinite: bool = False) -> np.ndarray:
     """A column of numbers; NaN where it is empty."""
     import pandas as pd
 
@@ -142,8 +165,8 @@ def numbers(column: pd.Series, name: str, path: Path) -> np.ndarray:
             raise row_error(path, name, int(column.index[i]), "a number", repr(column.iloc[i]))
         column = values
     result = column.to_numpy(dtype=float)
-    if (infinite := np.isinf(result)).any():
-        i = int(np.argmax(infinite))
+    if not infinite and (beyond := np.isinf(result)).any():
+        i = int(np.argmax(beyond))
         raise row_error(path, name, int(column.index[i]), "a finite number, or nothing", str(result[i]))
     return result
 
@@ -152,16 +175,16 @@ def _stripped(value: Any) -> Any:
     return value.strip() if isinstance(value, str) else value
 
 
-def frames(column: pd.Series, path: Path) -> np.ndarray:
+def frames(column: pd.Series, path: Path, name: str = "frame") -> np.ndarray:
     """A column of frames: whole numbers from 0."""
-    values = numbers(column, "frame", path)
+    values = numbers(column, name, path)
     with np.errstate(invalid="ignore"):
         wrong = ~((values >= 0) & (values == np.round(values)) & (values < _LAST_FRAME))
     if wrong.any():
         i = int(np.argmax(wrong))
         raise row_error(
             path,
-            "frame",
+            name,
             int(column.index[i]),
             "a whole number from 0",
             "nothing" if np.isnan(values[i]) else f"{values[i]:g}",
