@@ -37,6 +37,8 @@ def read_dlt(
     count from 1, so this v is that of OpenCV (pixel centres at integers, from 0), while x keeps the 1 of the
     file: over an image the points of such a recording lie one pixel to the right.
     A camera profile of Argus gives sizes only; its distortion belongs to points that are undistorted already.
+    The world must be right-handed, as the three programs make it: seen from a mirrored one, all points are
+    behind the cameras.
 
     Parameters
     ----------
