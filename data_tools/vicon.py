@@ -4,7 +4,7 @@ Each ``Camera`` holds its SENSOR_SIZE and, in its ``KeyFrame``, POSITION (centre
 ORIENTATION (quaternion x y z w, world to camera), FOCAL_LENGTH (px), PRINCIPAL_POINT (px from the top left,
 v down) and the lens, VICON_RADIAL2 (older files: VICON_RADIAL, about the principal point). The vertical focal
 length is FOCAL_LENGTH / PIXEL_ASPECT_RATIO, as other readers of these files have it; we know no file where
-the ratio is not 1. Where Vicon puts the centre of the first pixel is not documented; it is taken to be (0, 0).
+the ratio is not 1. Where Vicon puts the centre of the first pixel is not documented; here it is (0, 0).
 """
 
 from __future__ import annotations
