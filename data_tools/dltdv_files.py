@@ -182,10 +182,10 @@ def _read_sparse(path: Path, per_point: int) -> np.ndarray:
         with path.open(encoding="utf-8-sig") as file:
             file.readline()
             size = [int(value) for value in file.readline().split()]
-            entries = np.loadtxt(file, ndmin=2)
+            lines = file.readlines()
+        entries = np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 3))
     except (ValueError, UnicodeDecodeError) as error:
         raise fail("numbers: row, column, value", str(error)) from None
-    entries = entries.reshape(-1, 3) if entries.size == 0 else entries
     if len(size) != 3 or entries.shape[1] != 3 or len(entries) != size[2]:
         raise fail("its size in the second line, then row, column, value", f"{size}, {len(entries)} entries")
     if size[1] % per_point:

@@ -192,7 +192,7 @@ def _find(folder: Path, rig: CameraArray, used: Sequence[Path]) -> Given:
     raise InputError(
         "The folder holds no tracks that belong to its cameras.",
         file=folder,
-        expected=f"{rig.names[0]}.csv and so on, for each of {_some(rig.names)}; or a table with a column cam",
+        expected=f"{rig.names[0]}.csv and so on, for {_some(rig.names)}; or one table with a column cam",
         found=_some([p.name for p in here]),
         remedy="rename the files after their cameras, or name them: tracks=FILES",
     )

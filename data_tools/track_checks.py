@@ -12,6 +12,7 @@ from acino_fte.data_tools.tracks2d import Tracks2D
 from acino_fte.errors import InputError
 
 _OUTSIDE, _BORDER = 0.05, 0.02  # of the dots, of the image: as for keypoints
+_LONG, _SPARSE = 1_000_000, 100  # frames from the first to the last, and for each frame with a dot
 _FAR = 0.1  # of the image: noise and clutter at its edge are nothing to warn of
 
 
@@ -28,14 +29,14 @@ def check_tracks(views: Sequence[Tracks2D], cameras: CameraArray) -> list[str]:
     Returns
     -------
     list of str
-        Warnings: rows without coordinates, cameras without dots or with dots far outside the image, cameras with
-        one and the same pose.
+        Warnings: rows without coordinates, cameras without dots or with dots far outside the image, cameras
+        with one and the same pose.
 
     Raises
     ------
     InputError
-        More than 5 % of a camera's dots lie clearly outside its image, fewer than two cameras have dots, or
-        no two cameras have dots in the same frame.
+        More than 5 % of a camera's dots lie clearly outside its image, no two cameras have dots in the same
+        frame, or the frames are no numbers of images.
     """
     warnings = []
     for view, camera in zip(views, cameras, strict=True):
@@ -79,11 +80,23 @@ def _check_image(view: Tracks2D, resolution: tuple[int, int]) -> list[str]:
 
 
 def _check_frames(views: Sequence[Tracks2D]) -> None:
-    """Some frame has dots in two cameras."""
+    """Some frame has dots in two cameras, and frames count images."""
     seeing = [view for view in views if len(view)]
     frames = [np.unique(view.frame) for view in seeing]
-    if len(seeing) >= 2 and np.unique(np.concatenate(frames), return_counts=True)[1].max() >= 2:
-        return
+    if len(seeing) >= 2:
+        seen, n_cameras = np.unique(np.concatenate(frames), return_counts=True)
+        n_frames = int(seen[-1] - seen[0]) + 1
+        if n_frames > max(_LONG, _SPARSE * len(seen)):
+            raise InputError(
+                "The frames are far apart: they are hardly numbers of images.",
+                file=seeing[0].path,
+                key="frame",
+                expected="0, 1, 2, …, an image each",
+                found=f"{len(seen)} different frames from {seen[0]} to {seen[-1]}",
+                remedy="count images, not time stamps; or mend the row with the last frame",
+            )
+        if n_cameras.max() >= 2:
+            return
     ranges = ", ".join(
         f"{v.camera}: {v.frame.min()} to {v.frame.max()}" if len(v) else f"{v.camera}: none" for v in views
     )

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 SYNONYMS: dict[str, tuple[str, ...]] = {
     "frame": ("frame_number", "frame_idx", "frame_index", "frameid", "frame_id", "framenumber"),
-    "track": ("track_id", "trackid", "id", "identity", "individual", "particle", "label"),
+    "track": ("track_id", "trackid", "id", "identity", "individual", "particle"),
     "x": ("u", "px_x", "x_px", "col_index", "col", "column"),
     "y": ("v", "px_y", "y_px", "row_index", "row"),
     "cam": ("camera", "camera_id", "cam_id", "view"),
@@ -29,21 +29,19 @@ SYNONYMS: dict[str, tuple[str, ...]] = {
     "z": (),
 }
 _SEPARATORS = ",;\t"
-_LAST_FRAME = 2**53
+_LAST_FRAME = 2**31
 
 
 def read_table(path: Path, *, required: Sequence[str], optional: Sequence[str] = ()) -> pd.DataFrame:
     """The wanted columns under their own names; the index is the row of the file, from 0."""
-    import pandas as pd
-
     header, separator = read_header(path)
     found = matched_columns(header)
     for name in required:
         if name not in found:
             raise _missing_column(path, name, header)
     columns = {found[name]: name for name in (*required, *optional) if name in found}
-    table = _parse(path, header, sep=separator, usecols=list(columns), skip_blank_lines=False)
-    table.columns = pd.Index([columns[str(name)] for name in table.columns])
+    table = _parse(path, header, sep=separator, skip_blank_lines=False)
+    table = table[list(columns)].rename(columns=columns)
     filled = np.flatnonzero(table.notna().any(axis=1))
     if len(required) > 1:
         table = table.iloc[filled]  # blank lines are no dots
