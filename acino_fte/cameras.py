@@ -89,7 +89,7 @@ class Camera:
         """Position of the camera in the world, (3,) or (N, 3), m."""
         return -np.einsum("...ji,...j->...i", self.rotation, self.translation)
 
-    def at_frames(self, frames: slice) -> Camera:
+    def at_frames(self, frames: slice | np.ndarray) -> Camera:
         """The camera for a range of frames; a fixed camera is returned as it is."""
         if not self.moves:
             return self

@@ -1,0 +1,100 @@
+"""How sure is a match? The posterior probability of every piece's place, and what else it might have been.
+
+With everything else as it is, a piece may stay, be alone, go to another group, or change places with what that
+group holds in its view at the time. The log-odds of each alternative against the present state come from the same
+sums that made the groups, and
+
+    P(right) = 1 / (1 + Σ exp(log-odds of an alternative)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from acino_fte.data_tools.track_groups import PieceGraph
+
+_MOST = 700.0
+
+
+@dataclass(frozen=True, eq=False)
+class Confidence:
+    """Of V pieces.
+
+    Attributes
+    ----------
+    probability : (V,)
+        That the piece belongs to its group; NaN for a piece that is alone.
+    log_odds : (V,)
+        Against being alone.
+    rival : (V,) int
+        The most likely other group, −1 for none.
+    rival_probability : (V,)
+        Its probability; 0 for none.
+    """
+
+    probability: np.ndarray
+    log_odds: np.ndarray
+    rival: np.ndarray
+    rival_probability: np.ndarray
+
+
+def confidence_of(graph: PieceGraph, label: np.ndarray) -> Confidence:
+    """Confidence of every piece of a grouping.
+
+    Parameters
+    ----------
+    graph : PieceGraph
+    label : (V,) int
+        Group of every piece.
+    """
+    n = len(label)
+    piece, group, gain = _gains(graph, label)
+    own = np.zeros(n)
+    mine = label[piece] == group
+    own[piece[mine]] = gain[mine]
+    joined = np.zeros(n, dtype=bool)
+    joined[piece[mine]] = True
+    piece, group, gain = piece[~mine], group[~mine], gain[~mine]
+    change = gain - own[piece] + _displaced(graph, label, own, piece, group)
+    odds = np.exp(np.clip(change, -_MOST, _MOST))
+    against = np.exp(np.clip(-own, -_MOST, _MOST)) + np.bincount(piece, weights=odds, minlength=n)
+    rival, best = np.full(n, -1), np.zeros(n)
+    order = np.argsort(odds, kind="stable")  # the last one written is the largest
+    rival[piece[order]], best[piece[order]] = group[order], odds[order]
+    chance = 1.0 / (1.0 + against)
+    return Confidence(np.where(joined, chance, np.nan), own, rival, best * chance)
+
+
+def _gains(graph: PieceGraph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What each piece adds to each group that it has an edge to, its own without itself."""
+    n = len(label)
+    piece = np.concatenate([graph.u, graph.v])
+    group = label[np.concatenate([graph.v, graph.u])]
+    weight = np.concatenate([graph.weight, graph.weight])
+    key, inverse = np.unique(piece * np.int64(n) + group, return_inverse=True)
+    return key // n, key % n, np.bincount(inverse, weights=weight, minlength=len(key))
+
+
+def _displaced(
+    graph: PieceGraph, label: np.ndarray, own: np.ndarray, piece: np.ndarray, group: np.ndarray
+) -> np.ndarray:
+    """What the pieces lose, less what they may gain in exchange, that are in a group when a piece comes, (E,)."""
+    by_group = np.argsort(label, kind="stable")
+    low = np.searchsorted(label[by_group], group)
+    count = np.searchsorted(label[by_group], group, side="right") - low
+    offer = np.repeat(np.arange(len(piece)), count)
+    there = by_group[np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)]
+    comer = piece[offer]
+    clash = (graph.view[there] == graph.view[comer]) & (
+        np.minimum(graph.last[there], graph.last[comer]) >= np.maximum(graph.first[there], graph.first[comer])
+    )
+    offer, there, comer = offer[clash], there[clash], comer[clash]
+    all_piece, all_group, all_gain = _gains(graph, label)
+    n = np.int64(len(label))
+    known = all_piece * n + all_group
+    wanted = there * n + label[comer]
+    at = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
+    swap = np.where(known[at] == wanted, np.maximum(all_gain[at], 0.0), 0.0) if len(known) else 0.0
+    return np.bincount(offer, weights=swap - np.maximum(own[there], 0.0), minlength=len(piece))

@@ -1,0 +1,224 @@
+"""Pieces of tracks in all views into groups, one group an animal.
+
+Every edge between two pieces carries log-odds of being one animal; a group is worth the sum of its edges, in
+every pair of views and along time, so views that disagree pay for it, and a third view decides what two leave
+open. Two pieces of one view that are there at the same time are never one animal.
+
+The largest sum is sought by joining groups from the surest pair to the least sure (edge contraction, as Keuper
+et al. 2015, *Efficient decomposition of image and mesh graphs by lifted multicuts*, but by margin instead of by
+gain): the *margin* of a pair is its log-odds against everything it would exclude. What is open at first, two
+birds on one perch, is left until pieces joined meanwhile have pooled their evidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+ABSENT = -4.0
+"""Log-odds a frame of two pieces that overlap in time and were seldom near each other."""
+_MARGINS = (40.0, 20.0, 10.0, 6.0, 4.0, 2.0, 1.0)
+_BYTES = 50_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class PieceGraph:
+    """Pieces of all views and the evidence between them.
+
+    Attributes
+    ----------
+    view, first, last : (V,) int
+        View of each piece and the frames of its first and last dot, from 0.
+    u, v : (E,) int
+        Pieces that an edge joins; each pair at most once.
+    weight : (E,)
+        Log-odds of being one animal.
+    """
+
+    view: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Edges between groups: ends, summed log-odds, and frames of overlap that the sums account for."""
+
+    u: np.ndarray
+    v: np.ndarray
+    weight: np.ndarray
+    seen: np.ndarray
+
+    def take(self, which: np.ndarray) -> _Edges:
+        return _Edges(self.u[which], self.v[which], self.weight[which], self.seen[which])
+
+
+def group_pieces(graph: PieceGraph, least: float = 0.0) -> np.ndarray:
+    """Group of every piece, (V,) int from 0; a piece that joined nothing is a group of its own.
+
+    Parameters
+    ----------
+    graph : PieceGraph
+    least : float
+        Margin, log-odds, above which two groups are joined.
+    """
+    label = np.arange(len(graph.view))
+    if not len(graph.u):
+        return label
+    occupied = _occupancy(graph)
+    edges = _Edges(graph.u, graph.v, graph.weight, _overlap(graph, graph.u, graph.v))
+    for margin in (*(m for m in _MARGINS if m > least), least):
+        while True:
+            edges = _contract(edges, label)
+            total, compatible = _totals(edges, occupied)
+            edges, total = edges.take(compatible), total[compatible]
+            pairs = _surest(edges, total, occupied, margin)
+            if not len(pairs):
+                break
+            keep, gone = edges.u[pairs], edges.v[pairs]
+            occupied[keep] |= occupied[gone]
+            target = np.arange(len(label))
+            target[gone] = keep
+            label = target[label]
+    return np.unique(label, return_inverse=True)[1]
+
+
+def total_log_odds(graph: PieceGraph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Summed log-odds between groups of pieces, for those that have an edge and can be one animal.
+
+    Parameters
+    ----------
+    graph : PieceGraph
+    label : (V,) int
+        Group of every piece; any numbers from 0.
+
+    Returns
+    -------
+    u, v : (E,) int
+        Groups, u < v.
+    total : (E,)
+        Log-odds, overlaps without an edge included.
+    """
+    names, dense = np.unique(label, return_inverse=True)
+    occupied = np.zeros((len(names), *_shape(graph)), dtype=np.uint8)
+    np.bitwise_or.at(occupied, dense, _occupancy(graph))
+    edges = _contract(_Edges(graph.u, graph.v, graph.weight, _overlap(graph, graph.u, graph.v)), dense)
+    total, compatible = _totals(edges, occupied)
+    return names[edges.u[compatible]], names[edges.v[compatible]], total[compatible]
+
+
+def _shape(graph: PieceGraph) -> tuple[int, int]:
+    """Views and bytes of the bit fields."""
+    return int(graph.view.max()) + 1, -(-(int(graph.last.max()) + 1) // 8)
+
+
+def _overlap(graph: PieceGraph, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    shared = np.minimum(graph.last[u], graph.last[v]) - np.maximum(graph.first[u], graph.first[v]) + 1
+    return np.where(graph.view[u] == graph.view[v], 0, np.maximum(shared, 0)).astype(float)
+
+
+def _occupancy(graph: PieceGraph) -> np.ndarray:
+    """(V, views, bytes) bit field: the frames in which a group has a piece in a view."""
+    n_frames = int(graph.last.max()) + 1
+    frames = np.arange(n_frames)
+    occupied = np.zeros((len(graph.view), *_shape(graph)), dtype=np.uint8)
+    step = max(1, _BYTES // n_frames)
+    for start in range(0, len(graph.view), step):
+        part = np.arange(start, min(start + step, len(graph.view)))
+        there = (frames >= graph.first[part, None]) & (frames <= graph.last[part, None])
+        occupied[part, graph.view[part]] = np.packbits(there, axis=1)
+    return occupied
+
+
+def _contract(edges: _Edges, label: np.ndarray) -> _Edges:
+    """Edges between the groups of `label`, parallel ones summed, u < v."""
+    u, v = label[edges.u], label[edges.v]
+    u, v = np.minimum(u, v), np.maximum(u, v)
+    other = u != v
+    key = u[other] * np.int64(len(label)) + v[other]
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    if not len(key):
+        return edges.take(np.zeros(0, dtype=int))
+    heads = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+    weight = np.add.reduceat(edges.weight[other][order], heads)
+    seen = np.add.reduceat(edges.seen[other][order], heads)
+    return _Edges(key[heads] // len(label), key[heads] % len(label), weight, seen)
+
+
+_ONES = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
+
+
+def _totals(edges: _Edges, occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log-odds of each pair of groups with the overlaps that have no edge, and whether it can be one animal."""
+    views = range(occupied.shape[1])
+    overlap = np.zeros(len(edges.u))
+    compatible = np.ones(len(edges.u), dtype=bool)
+    step = max(1, _BYTES // (occupied.shape[1] * occupied.shape[2]))
+    for start in range(0, len(edges.u), step):
+        part = slice(start, start + step)
+        one, two = occupied[edges.u[part]], occupied[edges.v[part]]
+        compatible[part] = ~(one & two).any((1, 2))
+        for a in views:
+            for b in views:
+                if a != b:
+                    overlap[part] += _ONES[one[:, a] & two[:, b]].sum(1, dtype=np.int64)
+    return edges.weight + ABSENT * np.maximum(overlap - edges.seen, 0.0), compatible
+
+
+def _surest(edges: _Edges, total: np.ndarray, occupied: np.ndarray, least: float) -> np.ndarray:
+    """Edges with a margin above `least` that are the surest of both their groups."""
+    margin = margins(edges.u, edges.v, total, occupied)
+    good = np.flatnonzero(margin > least)
+    if not len(good):
+        return good
+    best = np.full(len(occupied), -np.inf)
+    np.maximum.at(best, edges.u[good], margin[good])
+    np.maximum.at(best, edges.v[good], margin[good])
+    mutual = good[(margin[good] >= best[edges.u[good]]) & (margin[good] >= best[edges.v[good]])]
+    taken: set[int] = set()  # equal margins: the first one
+    chosen = []
+    for e in mutual.tolist():
+        ends = {int(edges.u[e]), int(edges.v[e])}
+        if not ends & taken:
+            chosen.append(e)
+            taken |= ends
+    return np.array(chosen, dtype=int)
+
+
+def margins(u: np.ndarray, v: np.ndarray, total: np.ndarray, occupied: np.ndarray) -> np.ndarray:
+    """Log-odds of each pair against being apart and against every pair that it excludes, (E,).
+
+    A pair (u, v) excludes (u, v') when v and v' are there at the same time in one view.
+    """
+    margin = np.full(len(u), -np.inf)
+    useful = np.flatnonzero(total > 0)
+    u, v, total = u[useful], v[useful], total[useful]
+    against = np.maximum(_rivals(u, v, total, occupied), _rivals(v, u, total, occupied))
+    margin[useful] = total - against
+    return margin
+
+
+def _rivals(who: np.ndarray, other: np.ndarray, total: np.ndarray, occupied: np.ndarray) -> np.ndarray:
+    """Log of one (apart) and the odds of the pairs of the same group that a pair excludes, (E,)."""
+    order = np.argsort(who, kind="stable")
+    low = np.searchsorted(who[order], who)
+    count = np.searchsorted(who[order], who, side="right") - low
+    mine = np.repeat(np.arange(len(who)), count)
+    rival = order[np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)]
+    apart = mine != rival
+    mine, rival = mine[apart], rival[apart]
+    clash = np.zeros(len(mine), dtype=bool)
+    step = max(1, _BYTES // (occupied.shape[1] * occupied.shape[2]))
+    for start in range(0, len(mine), step):
+        part = slice(start, start + step)
+        clash[part] = (occupied[other[mine[part]]] & occupied[other[rival[part]]]).any((1, 2))
+    mine, rival = mine[clash], rival[clash]
+    top = np.zeros(len(who))
+    np.maximum.at(top, mine, total[rival])
+    share = np.bincount(mine, weights=np.exp(total[rival] - top[mine]), minlength=len(who))
+    return top + np.log(np.exp(-top) + share)
