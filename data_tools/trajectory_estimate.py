@@ -1,0 +1,117 @@
+"""Estimates how animals move between frames, from the pixels of all views.
+
+Shapes: T nodes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize
+
+from acino_fte.data_tools.trajectory_motion import N_LAGS, MotionModel, Pieces, log_information
+from acino_fte.data_tools.trajectory_smoother import ChainFactor
+
+_WINDOW, _SAMPLE = 50, 1500  # frames in a window, nodes to estimate the prior from
+_FLAT = 0.005  # gradient at which the search ends, about the error of log q
+_REACH = 3.5  # largest inverse hyperbolic tangent of a partial autocorrelation
+
+
+def estimate_motion(
+    x: np.ndarray,
+    information: np.ndarray,
+    gradient: np.ndarray,
+    pieces: Pieces,
+    start: MotionModel | None = None,
+) -> MotionModel:
+    """The prior of greatest marginal likelihood.
+
+    With the views linearised at x, the path is Gaussian and its integral is exact,
+
+        −2 log p(pixels) = min_x (χ²(pixels) + xᵀP x) + log det(Λ + P) − log det P + const.
+
+    Parameters
+    ----------
+    x : (T, 3)
+        Where the views are linearised.
+    information, gradient : (T, 3, 3), (T, 3)
+        Λ and Jᵀr/σ² there.
+    pieces : Pieces
+        Which frames hang together.
+    start : MotionModel, optional
+        Where to begin; by default from the moments of the displacements.
+    """
+    scale = max(float(np.ptp(x, axis=0).max()), 1e-6)
+    first = start or _from_moments(x, information, pieces)
+
+    def value(parameters: np.ndarray) -> float:
+        motion = _motion(parameters, scale)
+        try:
+            evidence = log_evidence(x, information, gradient, pieces, motion)
+        except np.linalg.LinAlgError:
+            return np.inf
+        return -evidence / (3.0 * pieces.n_nodes)  # curvature about 1 for log q
+
+    begin = np.array([np.log(first.step), *np.arctanh(np.clip(first.memory, -0.99, 0.99))])
+    found = minimize(value, begin, method="BFGS", options={"gtol": _FLAT, "eps": 1e-3, "maxiter": 25})
+    return _motion(found.x, scale)
+
+
+def log_evidence(
+    x: np.ndarray, information: np.ndarray, gradient: np.ndarray, pieces: Pieces, motion: MotionModel
+) -> float:
+    """log p(pixels) of a prior, up to a constant that no prior changes; arguments as above."""
+    factor = ChainFactor(information, motion, pieces)
+    prior = factor.prior_times(x)
+    step = factor.solve(gradient - prior)
+    moved = x + step
+    cost = np.einsum("ni,nij,nj->", step, information, step) - 2 * np.vdot(gradient, step)
+    cost += np.vdot(moved, prior + factor.prior_times(step))
+    return -0.5 * (float(cost) + factor.log_determinant) + 1.5 * log_information(motion, pieces)
+
+
+def _motion(parameters: np.ndarray, scale: float) -> MotionModel:
+    step = float(np.exp(np.clip(parameters[0], np.log(1e-6 * scale), np.log(10 * scale))))
+    r1, r2 = np.tanh(np.clip(parameters[1:], -_REACH, _REACH))
+    return MotionModel(step, (float(r1), float(r2)))
+
+
+def sample_windows(pieces: Pieces, known: np.ndarray) -> tuple[np.ndarray, Pieces]:
+    """Nodes of windows spread over all pieces; each has one node at least that is known (T,) bool."""
+    count = -(-pieces.length // _WINDOW)
+    begin = np.repeat(pieces.start, count) + _WINDOW * _count_up(count)
+    end = np.minimum(begin + _WINDOW, np.repeat(pieces.start + pieces.length, count))
+    total = np.concatenate([[0], np.cumsum(known)])
+    there = total[end] > total[begin]
+    begin, length = begin[there], (end - begin)[there]
+    order = np.random.default_rng(0).permutation(len(length))
+    chosen = np.sort(order[: np.searchsorted(np.cumsum(length[order]), _SAMPLE) + 1])
+    nodes = np.repeat(begin[chosen], length[chosen]) + _count_up(length[chosen])
+    return nodes, Pieces(length[chosen])
+
+
+def _count_up(counts: np.ndarray) -> np.ndarray:
+    """0 … c − 1 for each count c."""
+    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _from_moments(x: np.ndarray, information: np.ndarray, pieces: Pieces) -> MotionModel:
+    """A rough prior from the covariances of displacements, less what the pixels' noise adds to them."""
+    step = np.diff(x, axis=0, prepend=x[:1])
+    determinant = np.linalg.det(information)
+    met = (
+        determinant > 1e-3 * np.median(determinant[determinant > 0])
+        if (determinant > 0).any()
+        else determinant > 0
+    )
+    inner = (pieces.age >= N_LAGS) & met
+    for lag in range(1, N_LAGS + 1):
+        inner[lag:] &= met[:-lag]
+    eye = 1e-6 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    sure = np.linalg.inv(information + eye + 1e-12 * np.eye(3))
+    noise = float(np.median(np.trace(sure, axis1=1, axis2=2))) / 3.0
+    lagged = [float(np.mean((step[lag:] * step[: len(step) - lag])[inner[lag:]])) if inner.any() else 0.0
+              for lag in range(3)]  # fmt: skip
+    g0 = max(lagged[0] - 2 * noise, 0.05 * lagged[0], 1e-8)
+    r1 = float(np.clip((lagged[1] + noise) / g0, -0.5, 0.98))
+    r2 = float(np.clip((lagged[2] / g0 - r1**2) / (1 - r1**2), -0.8, 0.8))
+    return MotionModel(float(np.sqrt(g0 * (1 - r1**2) * (1 - r2**2))), (r1, r2))

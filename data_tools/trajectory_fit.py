@@ -1,0 +1,277 @@
+"""The most probable paths of all groups, and the rows that do not belong to them.
+
+Shapes: T nodes, P rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from acino_fte.data_tools.trajectory_estimate import estimate_motion, sample_windows
+from acino_fte.data_tools.trajectory_motion import MotionModel, Pieces
+from acino_fte.data_tools.trajectory_rows import Measurements
+from acino_fte.data_tools.trajectory_smoother import ChainFactor
+
+_MIN_SINE2 = np.sin(np.radians(1.0)) ** 2
+_MAX_STEPS, _DONE = 8, 0.5  # Gauss–Newton; the last step moves no pixel by more than this part of σ
+_ALONE = 1e-3  # keeps rows that nothing else predicts from being judged by rounding errors
+_ROUNDS, _ESTIMATES = 12, 3
+_BATCH = 30_000  # nodes fitted at once
+_NEIGHBOURS = 2  # frames before and after in which only the worst row leaves
+_DOUBT = 30.0  # squared residual of a frame's rows, in σ², beyond which they do not count at first
+
+
+@dataclass(frozen=True, eq=False)
+class PathFit:
+    """Most probable paths.
+
+    Attributes
+    ----------
+    x : (T, 3)
+        Positions, m.
+    covariance : (T, 3, 3)
+        m².
+    used : (P,) bool
+        Rows that belong.
+    distance : (P,)
+        Squared distance of each row from what the others predict, in units of its uncertainty.
+    residual : (P, 2)
+        Measured less predicted, px.
+    motion : MotionModel
+        The prior.
+    """
+
+    x: np.ndarray
+    covariance: np.ndarray
+    used: np.ndarray
+    distance: np.ndarray
+    residual: np.ndarray
+    motion: MotionModel
+
+
+def fit_paths(
+    rows: Measurements, pieces: Pieces, points: np.ndarray, motion: MotionModel | None, gate: float
+) -> PathFit:
+    """Fit all paths; wrong rows leave, and rows that belong after all come back.
+
+    Parameters
+    ----------
+    rows : Measurements
+        The rows.
+    pieces : Pieces
+        Which frames hang together.
+    points : (T, 3)
+        Where the rays of each node meet, NaN where they do not. Each piece has one at least.
+    motion : MotionModel, optional
+        The prior; by default it is estimated, and again once wrong rows have left.
+    gate : float
+        Distance beyond which a row is wrong.
+    """
+    prior = motion or _estimated(rows, pieces, points, gate)
+    n = pieces.n_nodes
+    x, covariance = np.empty((n, 3)), np.empty((n, 3, 3))
+    used, distance, residual = np.empty(len(rows), dtype=bool), np.empty(len(rows)), np.empty((len(rows), 2))
+    batch = pieces.start // _BATCH
+    for number in np.unique(batch):
+        mine = batch == number
+        at = slice(pieces.start[mine][0], pieces.start[mine][-1] + pieces.length[mine][-1])
+        chosen = np.flatnonzero((rows.node >= at.start) & (rows.node < at.stop))
+        part = rows.subset(chosen, rows.node[chosen] - at.start)
+        fit = _settled(part, Pieces(pieces.length[mine]), points[at], prior, gate)
+        x[at], covariance[at] = fit.x, fit.covariance
+        used[chosen], distance[chosen], residual[chosen] = fit.used, fit.distance, fit.residual
+    return PathFit(x, covariance, used, distance, residual, prior)
+
+
+def _settled(
+    rows: Measurements, pieces: Pieces, points: np.ndarray, motion: MotionModel, gate: float
+) -> PathFit:
+    """Fit with a given prior until no row leaves or returns."""
+    start = bridge(points, pieces)
+    linear = rows.linearise(start)
+    fit = _fit(rows, pieces, start, ~_doubtful(rows, linear[0], points), motion, linear)
+    for _ in range(_ROUNDS):
+        used = _judge(fit, rows, pieces, gate)
+        if (used == fit.used).all():
+            break
+        fit = _refit(fit, rows, pieces, used)
+    return fit
+
+
+def _estimated(rows: Measurements, pieces: Pieces, points: np.ndarray, gate: float) -> MotionModel:
+    """The prior from windows spread over all pieces; again after wrong rows have left."""
+    if not pieces.n_nodes:
+        return MotionModel(1.0)
+    nodes, windows = sample_windows(pieces, np.isfinite(points[:, 0]))
+    place = np.full(pieces.n_nodes, -1)
+    place[nodes] = np.arange(len(nodes))
+    chosen = np.flatnonzero(place[rows.node] >= 0)
+    rows, points = rows.subset(chosen, place[rows.node[chosen]]), points[nodes]
+    x = bridge(points, windows)
+    residual, slope = rows.linearise(x)
+    used = ~_doubtful(rows, residual, points)
+    motion = estimate_motion(x, *rows.information(residual, slope, used, len(x)), windows)
+    for _ in range(_ESTIMATES):
+        fit = _settled(rows, windows, points, motion, gate)
+        if (fit.used == used).all():
+            break
+        used = fit.used
+        at_path = rows.information(*rows.linearise(fit.x), used, len(x))
+        motion = estimate_motion(fit.x, *at_path, windows, motion)
+    return motion
+
+
+def _doubtful(rows: Measurements, residual: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Rows (P,) of nodes whose rays pass each other at some distance."""
+    n_nodes, met = len(points), np.isfinite(points[:, 0])
+    squared = np.nan_to_num((residual**2).sum(1) / rows.variance, nan=np.inf)
+    total = np.bincount(rows.node, squared, n_nodes)
+    return (met & (total > _DOUBT * np.bincount(rows.node, minlength=n_nodes)))[rows.node]
+
+
+def _judge(fit: PathFit, rows: Measurements, pieces: Pieces, gate: float) -> np.ndarray:
+    """Rows (P,) to use next: the worst of each neighbourhood leaves, rows within the gate return."""
+    wrong = fit.used & (fit.distance > gate)
+    worst = np.full(len(fit.x), -np.inf)
+    np.maximum.at(worst, rows.node[wrong], fit.distance[wrong])
+    piece = pieces.owner
+    around = worst.copy()
+    for lag in range(1, _NEIGHBOURS + 1):
+        same = piece[lag:] == piece[:-lag]
+        around[lag:] = np.where(same, np.maximum(around[lag:], worst[:-lag]), around[lag:])
+        around[:-lag] = np.where(same, np.maximum(around[:-lag], worst[lag:]), around[:-lag])
+    leave = wrong & (fit.distance >= around[rows.node])
+    return (fit.used & ~leave) | (~fit.used & (fit.distance <= gate))
+
+
+def _fit(
+    rows: Measurements,
+    pieces: Pieces,
+    start: np.ndarray,
+    used: np.ndarray,
+    motion: MotionModel,
+    linear: tuple[np.ndarray, np.ndarray] | None = None,
+) -> PathFit:
+    x, factor, residual, slope = improve(rows, used, start, pieces, motion, linear)
+    covariance = factor.covariance()
+    distance = deleted_distance(residual, slope, used, rows.variance, covariance[rows.node])
+    return PathFit(x, covariance, used, distance, residual, motion)
+
+
+def _refit(fit: PathFit, rows: Measurements, pieces: Pieces, used: np.ndarray) -> PathFit:
+    """Fit the pieces again in which rows left or returned."""
+    piece = pieces.owner
+    changed = np.zeros(len(pieces.length), dtype=bool)
+    changed[piece[rows.node[used != fit.used]]] = True
+    at_node, at_row = changed[piece], changed[piece[rows.node]]
+    chosen = np.flatnonzero(at_row)
+    new_node = np.cumsum(at_node) - 1
+    part = _fit(
+        rows.subset(chosen, new_node[rows.node[chosen]]),
+        Pieces(pieces.length[changed]),
+        fit.x[at_node],
+        used[chosen],
+        fit.motion,
+    )
+    whole = {key: getattr(fit, key).copy() for key in ("x", "covariance", "distance", "residual")}
+    for key in ("x", "covariance"):
+        whole[key][at_node] = getattr(part, key)
+    for key in ("distance", "residual"):
+        whole[key][chosen] = getattr(part, key)
+    return PathFit(used=used, motion=fit.motion, **whole)
+
+
+def meeting_points(measurements: Measurements, n_nodes: int) -> np.ndarray:
+    """Points nearest to the rays of each node (T, 3); NaN without rays that meet at over 1°."""
+    origin, direction = measurements.rays()
+    across = np.eye(3) - direction[:, :, None] * direction[:, None]
+    good = np.isfinite(across).all((-1, -2))
+    across = np.where(good[:, None, None], across, 0.0)
+    each = np.concatenate([across, across @ origin[..., None]], axis=2)
+    total = np.zeros((n_nodes, 3, 4))
+    for at, _ in measurements.parts():
+        np.add.at(total, measurements.node[at], each[at])
+    meet = np.linalg.det(total[..., :3]) > 2 * _MIN_SINE2  # two rays at an angle a: 2 sin² a
+    points = np.full((n_nodes, 3), np.nan)
+    points[meet] = np.linalg.solve(total[meet][..., :3], total[meet][..., 3:])[..., 0]
+    return points
+
+
+def bridge(points: np.ndarray, pieces: Pieces) -> np.ndarray:
+    """Points (T, 3) with NaN replaced along each piece: linear between neighbours, constant at the ends."""
+    known = np.isfinite(points[:, 0])
+    index = np.arange(len(points))
+    start = np.repeat(pieces.start, pieces.length)
+    end = np.repeat(pieces.start + pieces.length - 1, pieces.length)
+    before = np.maximum.accumulate(np.where(known, index, -1))
+    after = np.minimum.accumulate(np.where(known, index, len(points))[::-1])[::-1]
+    left = np.where(before >= start, before, np.where(after <= end, after, 0))
+    right = np.where(after <= end, after, left)
+    share = np.where(right > left, (index - left) / np.maximum(right - left, 1), 0.0)[:, None]
+    return (1 - share) * points[left] + share * points[right]
+
+
+def improve(
+    measurements: Measurements,
+    used: np.ndarray,
+    x: np.ndarray,
+    pieces: Pieces,
+    motion: MotionModel,
+    linear: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, ChainFactor, np.ndarray, np.ndarray]:
+    """Gauss–Newton steps to the most probable paths.
+
+    Returns the paths (T, 3), the factor of the last step, and there the residuals (P, 2) and the derivatives
+    (P, 2, 3) of the predictions.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The rows.
+    used : (P,) bool
+        Rows that count.
+    x : (T, 3)
+        Where to begin.
+    pieces : Pieces
+        Which frames hang together.
+    motion : MotionModel
+        The prior.
+    linear : tuple, optional
+        What :meth:`Measurements.linearise` gives at x, if it is known.
+    """
+    sigma = np.sqrt(measurements.variance)
+    for _ in range(_MAX_STEPS):
+        residual, slope = linear or measurements.linearise(x)
+        linear = None
+        information, gradient = measurements.information(residual, slope, used, len(x))
+        factor = ChainFactor(information, motion, pieces)
+        step = factor.solve(gradient - factor.prior_times(x))
+        x = x + step
+        moved = (slope * step[measurements.node][:, None]).sum(2)
+        if not np.nanmax(np.abs(moved) * (used / sigma)[:, None], initial=0.0) > _DONE:
+            break
+    return x, factor, residual - moved, slope
+
+
+def deleted_distance(
+    residual: np.ndarray, slope: np.ndarray, used: np.ndarray, variance: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Squared distance (P,) of each row from what all other rows predict, in units of its uncertainty.
+
+    For a row that is used, rᵀ (σ²I − J Σ Jᵀ)⁻¹ r equals the distance from the path without it (deletion
+    formula of least squares; Cook and Weisberg 1982, §2.2); else rᵀ (σ²I + J Σ Jᵀ)⁻¹ r. For
+    right rows it follows χ² with two degrees of freedom.
+    """
+    first, second = slope[:, 0], slope[:, 1]
+    u, v = ((covariance * side[:, None]).sum(2) for side in (first, second))
+    sign = np.where(used, -1.0, 1.0)
+    a, b, c = (sign * (left * right).sum(1) for left, right in ((first, u), (second, v), (first, v)))
+    a, b = a + variance * (1 + _ALONE), b + variance * (1 + _ALONE)
+    det = a * b - c**2
+    r0, r1 = residual.T
+    quadratic = b * r0**2 - 2 * c * r0 * r1 + a * r1**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = quadratic / np.maximum(det, 0.01 * (_ALONE * variance) ** 2)
+    return np.where(np.isfinite(distance), distance, np.inf)
