@@ -18,6 +18,7 @@ biological and biomimetic systems. Bioinspiration & Biomimetics 3, 034001.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 _PIXEL = re.compile(r"pt(\d+)_cam(\d+)_([xy])", re.IGNORECASE)
 _SPACE = re.compile(r"pt(\d+)_([xyz])", re.IGNORECASE)
+_LARGEST = 10**9
 _REMEDY = "save the points again with DLTdv"
 
 
@@ -149,19 +151,18 @@ def _read_named(path: Path, pattern: re.Pattern[str], layout: str) -> np.ndarray
             )
         *numbers, axis = match.groups()
         places.append((*(int(n) - 1 for n in numbers), "xyz".index(axis.lower())))
-    index = np.array(places).T
-    shape = tuple(int(n) + 1 for n in index.max(1))
-    if np.prod(shape) != len(set(places)) or len(places) != len(set(places)):
+    shape = tuple(max(numbers) + 1 for numbers in zip(*places, strict=True))
+    if not math.prod(shape) == len(places) == len(set(places)):
         raise InputError(
             "The table of digitised points is not complete.",
             file=path,
             key="header",
-            expected=f"{np.prod(shape)} columns: {layout}",
+            expected=f"{math.prod(shape)} columns: {layout}",
             found=f"{len(places)} columns, {len(set(places))} of them different",
             remedy=_REMEDY,
         )
     dense = np.full((len(values), *shape), np.nan)
-    dense[:, *index] = values
+    dense[:, *np.array(places).T] = values
     return dense
 
 
@@ -188,8 +189,8 @@ def _read_sparse(path: Path, per_point: int) -> np.ndarray:
         raise fail("numbers: row, column, value", str(error)) from None
     if len(size) != 3 or entries.shape[1] != 3 or len(entries) != size[2]:
         raise fail("its size in the second line, then row, column, value", f"{size}, {len(entries)} entries")
-    if size[1] % per_point:
-        raise fail(f"{per_point} columns for each point", f"{size[1]} columns")
+    if size[1] % per_point or not 0 < size[1] <= _LARGEST or not 0 <= size[0] <= _LARGEST // size[1]:
+        raise fail(f"{per_point} columns for each point, {_LARGEST:.0e} values", f"{size[0]}×{size[1]}")
     row, column = (entries[:, :2] - 1).T
     inside = (row >= 0) & (row < size[0]) & (column >= 0) & (column < size[1])
     if not (inside & np.isfinite(entries[:, 2])).all():

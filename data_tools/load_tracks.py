@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,6 +35,9 @@ from acino_fte.data_tools.tracker_exports import (
 )
 from acino_fte.data_tools.tracks2d import TrackRecording, Tracks2D
 from acino_fte.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _CAMERA_FILES = ("cameras.json", "cameras.toml", "calibration.toml")
 _DLT = re.compile(r".*dlt.*coef.*\.(csv|txt)", re.IGNORECASE)
@@ -185,7 +189,9 @@ def _find(folder: Path, rig: CameraArray, used: Sequence[Path]) -> Given:
         seen = {cameras_of(_stem(p), rig.names)[0] for p in named}
         if strangers or seen != set(rig.names):
             raise _no_fit(folder, [p.name for p in (*named, *strangers)], rig)
-        return named
+        exact = [p for p in named if same_name(_stem(p)) in map(same_name, rig.names)]
+        settled = {cameras_of(_stem(p), rig.names)[0] for p in exact}
+        return exact + [p for p in named if cameras_of(_stem(p), rig.names)[0] not in settled]
     joint = [p for p in files if p.suffix.lower() in (".csv", ".tsv") and has_camera_column(p)]
     if joint:
         return _only(joint, folder)
@@ -323,7 +329,7 @@ def _only(paths: Sequence[Path], folder: Path) -> Path:
     )
 
 
-def _truth_3d(folder: Path, given: Path | str | None):
+def _truth_3d(folder: Path, given: Path | str | None) -> pd.DataFrame | None:
     path = folder / _TRUTH_3D if given is None else Path(given)
     if given is None and not path.is_file():
         return None

@@ -6,6 +6,7 @@ A message about a value counts rows as the file does: after the header, from 1, 
 from __future__ import annotations
 
 import csv
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -218,10 +219,10 @@ def labels(column: pd.Series) -> pd.Series:
     import pandas as pd
 
     if pd.api.types.is_numeric_dtype(column):
-        values = column.to_numpy(dtype=float)
-        bare = ~np.isfinite(values) | (values == BARE)
+        values = column.to_numpy()
+        bare = np.isnan(values) | np.isinf(values) | (values == BARE)
         known, place = np.unique(values[~bare], return_inverse=True)
-        text = np.array([f"{v:.0f}" if v == round(v) else repr(float(v)) for v in known], dtype=object)
+        text = np.array([str(int(v)) if v == round(v) else repr(float(v)) for v in known], dtype=object)
         result = np.full(len(values), None, dtype=object)
         result[~bare] = text[place]
         return pd.Series(result, index=column.index, dtype=object)
@@ -231,8 +232,8 @@ def labels(column: pd.Series) -> pd.Series:
 
 
 def natural_order(name: str) -> tuple[int, float, str]:
-    """Numbers in the order of their value, before names."""
+    """Sorts numbers by their value, before names; and id2 before id10."""
     try:
         return (0, float(name), name)
     except ValueError:
-        return (1, 0.0, name)
+        return (1, 0.0, re.sub(r"\d+", lambda number: number[0].zfill(12), name))

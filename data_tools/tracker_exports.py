@@ -32,6 +32,7 @@ from acino_fte.errors import InputError, did_you_mean
 _TREX_POINTS = ("#wcentroid", "#centroid", "#pcentroid", "", "#head")
 _TREX_OTHERS = re.compile(r"_(posture|heatmap|tracklet_images|visual_field|statistics|recognition)", re.I)
 _IDTRACKER_NAMES = ("trajectories", "validated", "without_gaps", "with_gaps", "trajectories_wo_gaps")
+_BROKEN = (RuntimeError, ValueError, TypeError, AttributeError, MemoryError)  # as readers of cut files end
 _IDTRACKER_XY = re.compile(r"([xy])(\d+)", re.I)
 
 
@@ -231,6 +232,7 @@ def _trex_individual(
 def _npz_columns(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an ``.npz``; pickled ones are passed over."""
     import zipfile
+    import zlib
 
     if not path.is_file():
         raise InputError("The file does not exist.", file=path, remedy="check the path")
@@ -240,7 +242,7 @@ def _npz_columns(path: Path) -> dict[str, np.ndarray]:
             for name in file.files:
                 if name in ("frame", "missing", "cm_per_pixel") or re.fullmatch(r"[XY](#\w+)?", name):
                     columns[name] = file[name]
-    except (OSError, ValueError, zipfile.BadZipFile, AttributeError) as error:
+    except (OSError, EOFError, zipfile.BadZipFile, zlib.error, *_BROKEN) as error:
         raise InputError(
             "The file cannot be read as NumPy arrays.",
             file=path,
@@ -276,7 +278,7 @@ def _idtracker_pickle(path: Path) -> tuple[Any, Any]:
             data = load_data_pickle(file.read(), file=path)
     except FileNotFoundError:
         raise InputError("The file does not exist.", file=path, remedy="check the path") from None
-    except (OSError, ValueError) as error:
+    except (OSError, EOFError, *_BROKEN) as error:
         raise _no_trajectories(path, str(error)) from None
     data = data.item() if isinstance(data, np.ndarray) and data.shape == () else data
     if not isinstance(data, dict) or "trajectories" not in data:
@@ -290,8 +292,8 @@ def _idtracker_table(path: Path) -> np.ndarray:
     places = {name.lower(): i for i, name in enumerate(names)}
     found = [m for name in places if (m := _IDTRACKER_XY.fullmatch(name))]
     n = max((int(m[2]) for m in found), default=0)
-    wanted = [f"{axis}{i}" for i in range(1, n + 1) for axis in "xy"]
-    if not wanted or not set(wanted) <= set(places):
+    wanted = [f"{axis}{i}" for i in range(1, min(n, len(names)) + 1) for axis in "xy"]
+    if not wanted or len(wanted) != 2 * n or not set(wanted) <= set(places):
         raise _no_trajectories(path, ", ".join(names)[:200])
     return values[:, [places[name] for name in wanted]].reshape(len(values), n, 2)
 
@@ -334,13 +336,15 @@ def _hdf5(path: Path) -> Iterator[Any]:
     import h5py
 
     try:
-        file = h5py.File(path, "r")
-    except OSError as error:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, KeyError, *_BROKEN) as error:
         raise InputError(
-            "The file cannot be read as HDF5.", file=path, found=str(error)[:200], remedy="check the path"
+            "The file cannot be read as HDF5.",
+            file=path,
+            found=str(error)[:200],
+            remedy="check the path, or export the tracks again",
         ) from None
-    with file:
-        yield file
 
 
 def _text(value: Any) -> str:

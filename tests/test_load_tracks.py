@@ -116,7 +116,9 @@ def test_a_folder_of_tables(tmp_path):
     tables = write_folder(tmp_path / "birds")
     xyz = points()
     frame, animal = np.indices(xyz.shape[:2]).reshape(2, -1)
-    truth = pd.DataFrame({"frame": frame, "animal": animal, **dict(zip("xyz", xyz.reshape(-1, 3).T, strict=True))})
+    truth = pd.DataFrame(
+        {"frame": frame, "animal": animal, **dict(zip("xyz", xyz.reshape(-1, 3).T, strict=True))}
+    )
     truth.to_csv(tmp_path / "birds" / "truth_3d.csv", index=False)
     recording = load_tracks(tmp_path / "birds", fps=30)
     same(recording, tables)
@@ -125,6 +127,10 @@ def test_a_folder_of_tables(tmp_path):
     assert recording.cameras.names == ["cam0", "cam1"]
     assert (recording.first_frame, recording.n_frames) == (0, N_FRAMES)
     assert recording.warnings == ()
+    shutil.copy(
+        tmp_path / "birds" / "cam0.csv", tmp_path / "birds" / "cam0_old.csv"
+    )  # cam0.csv says it better
+    assert load_tracks(tmp_path / "birds").views[0].path.name == "cam0.csv"
     pd.testing.assert_frame_equal(recording.truth_3d, truth)
 
 
@@ -264,7 +270,9 @@ def test_folders_of_trackers(tmp_path):
     for c, name in enumerate(cameras.names):
         (tmp_path / "trex" / name / "data").mkdir(parents=True)
         write_trex(tmp_path / "trex" / name / "data", xy[c], 0.02, ending="npz")
-        write_idtracker(tmp_path / "idtracker" / f"session_{name}" / "trajectories", xy[c], kind="npy", labels=labels)
+        write_idtracker(
+            tmp_path / "idtracker" / f"session_{name}" / "trajectories", xy[c], kind="npy", labels=labels
+        )
         (tmp_path / "sleap").mkdir(exist_ok=True)
         write_sleap(tmp_path / "sleap" / f"{name}.analysis.h5", xy[c][:, :, None], ("body",))
         (tmp_path / "flat").mkdir(exist_ok=True)
@@ -501,4 +509,6 @@ def test_detections_are_joined_with_the_columns_of_the_coefficients():
 def test_a_mouse_in_four_cameras():
     recording = load_tracks(MOUSE, camera_unit="mm", node="Nose")
     assert recording.cameras.names == ["back", "mid", "side", "top"]
-    assert [view.path.name for view in recording.views] == [f"{n}.analysis.h5" for n in recording.cameras.names]
+    assert [view.path.name for view in recording.views] == [
+        f"{n}.analysis.h5" for n in recording.cameras.names
+    ]

@@ -20,6 +20,7 @@ from acino_fte.data_tools.track_files import (
 )
 from acino_fte.data_tools.tracker_exports import exporter, read_idtracker, read_sleap, read_trex, session_file
 from acino_fte.data_tools.tracks2d import Tracks2D
+from acino_fte.errors import InputError
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 BATS, WAND, MOUSE = SHARED / "bats", SHARED / "bats_wand", SHARED / "sleap_mouse"
@@ -64,6 +65,10 @@ def test_a_table_is_read_in_the_order_of_its_rows(tmp_path):
     assert view.row.tolist() == [0, 1, 2]
     assert view.left_out is None
     assert view.animal is None
+    view = read(tmp_path, "frame,track,x,y\n0,id10,1,2\n0,id2,3,4\n0,9007199254740993,5,6\n")
+    assert view.labels == ("9007199254740993", "id2", "id10")
+    view = read(tmp_path, "frame,track,x,y\n0,9007199254740993,1,2\n0,9007199254740992,3,4\n0,-1,5,6\n")
+    assert view.labels == ("9007199254740992", "9007199254740993")
 
 
 @pytest.mark.parametrize(
@@ -508,3 +513,53 @@ def test_a_mouse_is_where_its_nose_is():
         expected = file["tracks"][0, :, 0].T
     np.testing.assert_array_equal(view.xy, expected[np.isfinite(expected).all(1)])
     assert view.labels == ("track_0",)
+
+
+# ---------------------------------------------------------------------------------- files that were cut
+
+
+def readers(folder: Path) -> list:
+    xy, poses = grid(), np.random.default_rng(4).uniform(0, 600, (6, 3, 2, 2))
+    long = "frame,track,x,y\n" + "".join(f"{i},{i % 3},{2.5 * i},{3 * i}\n" for i in range(9))
+    return [
+        (write(folder / "long.csv", long), lambda path: read_track_table(path, "c")),
+        (write_xypts(folder / "axypts.csv", poses), lambda path: read_xypts(path, [512] * 2)),
+        (write_xypts(folder / "axypts.tsv", poses), lambda path: read_xypts(path, [512] * 2)),
+        (write_trex(folder, xy, 0.05, ending="npz")[0], lambda path: read_trex([path], "c")),
+        (write_idtracker(folder, xy, kind="npy"), lambda path: read_idtracker(path, "c")),
+        (write_idtracker(folder, xy, kind="h5"), lambda path: read_idtracker(path, "c")),
+        (write_idtracker(folder, xy, kind="csv"), lambda path: read_idtracker(path, "c")),
+        (write_sleap(folder / "s.h5", poses), lambda path: read_sleap(path, "c")),
+    ]
+
+
+@pytest.mark.parametrize("which", range(8))
+def test_spoilt_files_are_read_or_refused_and_nothing_else(tmp_path, which):
+    path, reader = readers(tmp_path)[which]
+    whole, refused = path.read_bytes(), 0
+    rng = np.random.default_rng(5)
+    for i in range(60):
+        spoilt = bytearray(whole)
+        at = int(rng.integers(len(whole)))
+        if i % 3 == 0 or path.suffix == ".npy":  # NumPy does not check a pickled dtype byte by byte
+            spoilt = spoilt[:at]
+        elif i % 3 == 1:
+            spoilt[at] = int(rng.integers(256))
+        else:
+            spoilt[at:at] = [b",", b"\n", b"99999999999999999999", b"\0", b'"'][i % 5]
+        path.write_bytes(spoilt)
+        try:
+            reader(path)
+        except InputError:
+            refused += 1
+        exporter(path)
+    assert refused > 10
+
+
+def test_impossible_sizes_are_refused_at_once(tmp_path):
+    path = write(tmp_path / "t.csv", "time,x1,y99999999999\n0,1,2\n")
+    assert message(read_idtracker, path, "c")
+    path = write(tmp_path / "axypts.csv", "pt1_cam1_X,pt99999999999_cam1_Y\n1,2\n")
+    assert message(read_xypts, path, [512])
+    path = write(tmp_path / "axypts.tsv", "title\n999999999999\t4\t0\n")
+    assert message(read_xypts, path, [512])
