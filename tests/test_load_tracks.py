@@ -26,6 +26,8 @@ from acino_fte.cameras import Camera, CameraArray
 from acino_fte.data_tools.calibration import write_cameras
 from acino_fte.data_tools.load_tracks import load_tracks
 from acino_fte.data_tools.projective_camera import projection_matrix
+from acino_fte.data_tools.simulate_tracks import TrackSimulation, simulate_tracks
+from acino_fte.data_tools.track_folder import write_tracks
 from acino_fte.data_tools.track_names import cameras_of, same_name
 from acino_fte.data_tools.tracks2d import TrackRecording
 from acino_fte.errors import InputError
@@ -309,6 +311,25 @@ def test_moving_cameras_have_the_poses_of_the_frames_with_dots(tmp_path):
     error = message(load_tracks, tmp_path, cameras=moving(N_FRAMES + 2))
     assert "too few poses" in error.problem
     assert error.found == str(N_FRAMES + 2)
+
+
+@pytest.mark.parametrize("kind", [{"lens": "fisheye"}, {"rig": "ring", "n_cameras": 3, "moving": True}, {}])
+def test_a_simulation_is_read_as_it_was_written(tmp_path, kind):
+    options = TrackSimulation(n_animals=5, n_frames=40, tracks="fragments", missed=0.1, clutter=0.1, **kind)
+    simulated = simulate_tracks(options)
+    write_tracks(simulated, tmp_path / "flock")
+    recording = load_tracks(tmp_path / "flock", fps=simulated.fps)
+    assert recording.cameras.names == simulated.cameras.names
+    assert recording.first_frame == simulated.first_frame
+    for a, b in zip(simulated.cameras, recording.cameras, strict=True):
+        np.testing.assert_array_equal(a.rotation, b.rotation)
+        np.testing.assert_array_equal(a.translation, b.translation)
+    for a, b in zip(simulated.views, recording.views, strict=True):
+        np.testing.assert_array_equal(a.frame, b.frame)
+        np.testing.assert_array_equal(a.animal, b.animal)
+        np.testing.assert_allclose(a.xy, b.xy, atol=1e-4)
+        assert [a.labels[t] for t in a.track] == [b.labels[t] for t in b.track]
+    np.testing.assert_allclose(recording.truth_3d, simulated.truth_3d, atol=1e-6)
 
 
 # -------------------------------------------------------------------------------------------- faults
