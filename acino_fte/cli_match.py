@@ -1,0 +1,451 @@
+"""The command ``acino-fte match``: which dot is which animal, over all views, and their tracks in 3D."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from acino_fte.cli_common import EXIT_OTHER, on_terminal, reported_errors, stderr, stdout, warn
+from acino_fte.errors import InputError
+
+if TYPE_CHECKING:
+    from acino_fte.data_tools.track_matching import MatchOptions, TrackMatches
+    from acino_fte.data_tools.tracks2d import TrackRecording
+
+
+class _Method(StrEnum):
+    tracks = "tracks"
+    thesis = "thesis"
+
+
+class _Unit(StrEnum):
+    m = "m"
+    cm = "cm"
+    mm = "mm"
+
+
+_INPUT, _MATCHING, _THESIS, _OUTPUT = "Input", "Matching", "The thesis's method", "Output"
+
+
+def match(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="A folder with the cameras (cameras.json, .toml, .xcp, dltCoefs.csv) and the 2D tracks of each "
+            "(cam0.csv, cam1.csv … with frame, track, x, y; DLTdv xypts; TRex, idtracker.ai, SLEAP exports); or "
+            "the file with the tracks of all cameras.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Result folder. [dim]\\[default: out/NAME][/]", rich_help_panel=_OUTPUT
+        ),
+    ] = None,
+    cameras: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The camera file.", rich_help_panel=_INPUT)
+    ] = None,
+    tracks: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE|CAMERA=FILE",
+            help="A file of tracks; once for each camera, or once for a file with all of them.",
+            rich_help_panel=_INPUT,
+            show_default=False,
+        ),
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="True positions (frame, animal, x, y, z in m, or xyzpts), for scoring only. Truth that lies "
+            "beside the tracks (truth_3d.csv, camN_truth.csv) is found without.",
+            rich_help_panel=_INPUT,
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frames per second of the recording.", rich_help_panel=_INPUT)
+    ] = None,
+    resolution: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WIDTHxHEIGHT",
+            help="Size of the images, px: DLT coefficients do not say it.",
+            rich_help_panel=_INPUT,
+        ),
+    ] = None,
+    camera_unit: Annotated[
+        _Unit, typer.Option(help="Unit of the positions in the camera file.", rich_help_panel=_INPUT)
+    ] = _Unit.m,
+    node: Annotated[
+        str | None,
+        typer.Option(
+            help="Node of SLEAP's skeleton that stands for the animal.",
+            rich_help_panel=_INPUT,
+            show_default="mean of all",
+        ),
+    ] = None,
+    cm_per_pixel: Annotated[
+        float | None,
+        typer.Option(help="TRex's setting, where its files do not say it.", rich_help_panel=_INPUT),
+    ] = None,
+    bare: Annotated[
+        bool,
+        typer.Option("--bare", help="Forget the tracks: every dot by itself.", rich_help_panel=_INPUT),
+    ] = False,
+    method: Annotated[
+        _Method,
+        typer.Option(
+            help="Whole tracks decide (tracks), or the thesis's way, dot by dot, for comparison (thesis).",
+            rich_help_panel=_MATCHING,
+        ),
+    ] = _Method.tracks,
+    noise_px: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of a dot's coordinate, px.",
+            rich_help_panel=_MATCHING,
+            show_default="estimated",
+        ),
+    ] = None,
+    max_gap: Annotated[
+        float,
+        typer.Option(
+            help="Longest gap within a view across which a track is continued, s.", rich_help_panel=_MATCHING
+        ),
+    ] = 1.0,
+    encounter: Annotated[
+        float,
+        typer.Option(
+            help="Animals closer than this in a view may have been exchanged, standard deviations of the noise.",
+            rich_help_panel=_MATCHING,
+        ),
+    ] = 4.0,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            help="Follow animals in 3D: smooth paths, which drop wrong dots, claim loose ones and fill gaps.",
+            rich_help_panel=_MATCHING,
+        ),
+    ] = True,
+    min_confidence: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, help="Leave out less probable matches.", rich_help_panel=_MATCHING),
+    ] = 0.5,
+    sets: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=3,
+            help="1: epipolar lines; 2: and the Kalman forecast; 3: and a second run with the future.",
+            rich_help_panel=_THESIS,
+        ),
+    ] = 2,
+    gate_m: Annotated[
+        float, typer.Option(help="Largest distance to the forecast, m.", rich_help_panel=_THESIS)
+    ] = 0.3,
+    gate_px: Annotated[
+        float,
+        typer.Option(help="Largest distance to the lines without a forecast, px.", rich_help_panel=_THESIS),
+    ] = 50.0,
+    min_estimates: Annotated[
+        int, typer.Option(help="Estimates that a forecast needs.", rich_help_panel=_THESIS)
+    ] = 5,
+    window: Annotated[
+        int, typer.Option(help="Frames that the filter looks back.", rich_help_panel=_THESIS)
+    ] = 10,
+    unchecked: Annotated[
+        int,
+        typer.Option(min=0, help="First rows of camera 1 that no gate judges.", rich_help_panel=_THESIS),
+    ] = 11,
+    fixed: Annotated[
+        bool, typer.Option("--fixed", help="Mend the faults of its forecast.", rich_help_panel=_THESIS)
+    ] = False,
+    vote: Annotated[
+        bool,
+        typer.Option("--vote", help="Let whole tracks vote on their pairs.", rich_help_panel=_THESIS),
+    ] = False,
+    formats: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="FORMATS",
+            help="Beside CSV: some of netcdf (movement), dltdv (xypts, xyzpts), with commas; or 'csv'.",
+            rich_help_panel=_OUTPUT,
+        ),
+    ] = "netcdf,dltdv",
+    figures: Annotated[
+        bool, typer.Option(help="Draw figures and the report.", rich_help_panel=_OUTPUT)
+    ] = True,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print errors and warnings only.", rich_help_panel=_OUTPUT)
+    ] = False,
+) -> None:
+    """Find out which dot is which animal in all cameras of a FOLDER, and rebuild their 3D tracks.
+
+    Writes observations.csv (the animal of every row of the input), tracks_3d.csv, matches.csv, metrics.json, the
+    layouts of movement and DLTdv, figures and a report. Leaves with 0 when animals were matched, 2 when the
+    input is wrong, 1 for anything else (also when nothing could be matched; that is saved).
+
+    Example: acino-fte match recording/ --fps 30 -o out/birds
+    """
+    with reported_errors():
+        target = _target(folder, out)
+        kinds = _formats(formats)
+        clock = _Clock()
+        with _spinner(quiet) as show:
+
+            def tell(step: str) -> None:
+                clock.begin(step)
+                show(step)
+
+            tell("reading")
+            if method is _Method.thesis:
+                from acino_fte.data_tools.thesis_method import ThesisOptions
+
+                options: Any = ThesisOptions(
+                    sets, gate_m, gate_px, min_estimates, window, unchecked, fixed, vote
+                )
+            else:
+                options = _match_options(noise_px, max_gap, encounter, follow, min_confidence)
+            recording = _read(
+                folder,
+                _Input(
+                    cameras, tracks or [], truth, fps, resolution, camera_unit.value, node, cm_per_pixel, bare
+                ),
+            )
+            for message in recording.warnings:
+                warn(message)
+            matches = _match(recording, options, tell)
+            clock.end()
+            from acino_fte.data_tools.match_files import save_matches
+
+            metrics = save_matches(
+                matches,
+                target,
+                method={"method": method.value, "options": asdict(options)},
+                seconds=clock.seconds,
+                formats=kinds,
+                figures=figures,
+                tell=show,
+            )
+        for message in metrics["warnings"][len(recording.warnings) :]:
+            warn(message)
+        if not quiet:
+            _summary(metrics, target)
+    if not metrics["n_animals"]:
+        stderr.print(
+            "[bold yellow]nothing was matched[/]: check that the camera file belongs to the tracks, that the "
+            "frames of all cameras have one clock, and --noise-px"
+        )
+        raise typer.Exit(EXIT_OTHER)
+
+
+@dataclass(frozen=True)
+class _Input:
+    cameras: Path | None
+    tracks: list[str]
+    truth: Path | None
+    fps: float | None
+    resolution: str | None
+    camera_unit: str
+    node: str | None
+    cm_per_pixel: float | None
+    bare: bool
+
+
+def _target(folder: Path, out: Path | None) -> Path:
+    """The output folder, apart from the input."""
+    from acino_fte.data_tools.match_files import MATCHING
+    from acino_fte.result_files import check_output_folder
+
+    name = folder.resolve().stem if folder.is_file() else folder.resolve().name
+    out = out or Path("out") / (name or "matching")
+    return check_output_folder(out, input_folder=folder if folder.exists() else None, contents=MATCHING)
+
+
+def _formats(text: str) -> tuple[str, ...]:
+    from acino_fte.data_tools.match_files import FORMATS
+
+    names = [name.strip().lower() for name in text.split(",") if name.strip()]
+    wrong = [name for name in names if name not in (*FORMATS, "csv")]
+    if wrong:
+        raise InputError(
+            "This format is not known.",
+            key="--format",
+            expected=f"some of csv, {', '.join(FORMATS)}, with commas between them",
+            found=", ".join(wrong),
+        )
+    return tuple(name for name in FORMATS if name in names)
+
+
+def _match_options(
+    noise_px: float | None, max_gap: float, encounter: float, follow: bool, min_confidence: float
+) -> MatchOptions:
+    from acino_fte.data_tools.track_matching import MatchOptions
+
+    for key, value in (("--noise-px", noise_px), ("--max-gap", max_gap), ("--encounter", encounter)):
+        if value is not None and not 0 < value < float("inf"):
+            raise InputError("The option is impossible.", key=key, expected="above 0", found=f"{value:g}")
+    return MatchOptions(noise_px, max_gap, encounter, follow, min_confidence)
+
+
+def _read(folder: Path, given: _Input) -> TrackRecording:
+    """The recording of a folder."""
+    from dataclasses import replace
+
+    from acino_fte.data_tools.load_tracks import load_tracks
+
+    recording = load_tracks(
+        folder,
+        cameras=given.cameras,
+        tracks=_tracks(given.tracks),
+        fps=given.fps,
+        truth_3d=given.truth,
+        resolution=_resolution(given.resolution),
+        camera_unit=given.camera_unit,
+        node=given.node,
+        cm_per_pixel=given.cm_per_pixel,
+    )
+    if given.bare:
+        recording = replace(recording, views=tuple(view.without_tracks() for view in recording.views))
+    return recording
+
+
+def _tracks(given: list[str]) -> list[Path | str] | dict[str, Path | str] | None:
+    """Files of tracks, or camera → file."""
+    if not given:
+        return None
+    named = ["=" in text and not Path(text).exists() for text in given]
+    if not any(named):
+        return [Path(text) for text in given]
+    if not all(named):
+        raise InputError(
+            "Some files of tracks have the name of their camera and some have not.",
+            key="--tracks",
+            expected="CAMERA=FILE for all, or FILE for all",
+            found=", ".join(given),
+        )
+    pairs = [text.split("=", 1) for text in given]
+    names = [name for name, _ in pairs]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError("A camera is given two files of tracks.", key="--tracks", found=", ".join(twice))
+    return {name: Path(path) for name, path in pairs}
+
+
+def _resolution(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    parts = text.lower().replace("×", "x").split("x")
+    if len(parts) == 2 and all(part.strip().isdigit() and int(part) > 0 for part in parts):
+        return int(parts[0]), int(parts[1])
+    raise InputError(
+        "The size of the images cannot be read.",
+        key="--resolution",
+        expected="WIDTHxHEIGHT in px, such as 1920x1080",
+        found=text,
+    )
+
+
+def _match(recording: TrackRecording, options: Any, tell: Callable[[str], None]) -> TrackMatches:
+    from acino_fte.data_tools.track_matching import MatchOptions, match_tracks
+
+    if isinstance(options, MatchOptions):
+        return match_tracks(recording, options, tell)
+    from acino_fte.data_tools.match_methods import thesis_matches
+
+    return thesis_matches(recording, options, tell)
+
+
+@dataclass
+class _Clock:
+    """Seconds of every step; a step that comes again is added up."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    _name: str = ""
+    _begun: float = 0.0
+
+    def begin(self, name: str) -> None:
+        """End the step under way and begin another."""
+        self.end()
+        self._name, self._begun = name, time.perf_counter()
+
+    def end(self) -> None:
+        """End the step under way."""
+        if self._name:
+            passed = time.perf_counter() - self._begun
+            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + passed
+        self._name = ""
+
+
+@contextmanager
+def _spinner(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """The step under way and the time so far, on a terminal; nothing in a pipe."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    with Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        console=stderr,
+        transient=True,
+        disable=quiet or not on_terminal(),
+    ) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda text: bar.update(task, description=escape(text))
+
+
+def _summary(metrics: dict[str, Any], target: Path) -> None:
+    """What was found, on the terminal."""
+    begin, end = metrics["frames"]
+    lines = [f"{metrics['n_animals']} animals in {end - begin} frames of {metrics['n_cameras']} cameras"]
+    for name, view in metrics["cameras"].items():
+        share = f" ({view['matched_share']:.1%})" if view["rows"] else ""
+        lines.append(f"  {name}: {view['matched']} of {view['rows']} rows matched{share}")
+    noise, error = metrics["noise_px"]["total"], metrics["reprojection_px"]
+    if noise is not None:
+        slow = metrics["noise_px"]["slow"]
+        lines.append(f"noise {noise:.2f} px" + (f", {slow:.2f} px of it slow" if slow else ""))
+    if error["count"]:
+        lines.append(f"reprojection {error['median']:.2f} px median, {error['p90']:.2f} px in 90 %")
+    lines += _scores(metrics["truth"])
+    seconds = metrics["seconds"]
+    matching = seconds["total"] - sum(seconds.get(name, 0.0) for name in ("reading", "tables", "figures"))
+    lines.append(f"matched in {matching:.2f} s, {seconds['total']:.1f} s in all")
+    for line in lines:
+        stdout.print(line, markup=False)
+    stdout.print(f"written to {escape(str(target))}")
+
+
+def _scores(truth: dict[str, Any] | None) -> list[str]:
+    """Lines about the truth."""
+    if truth is None:
+        return []
+
+    def number(key: str) -> str:
+        return "–" if truth[key] is None else f"{truth[key]:.4f}"
+
+    lines = [
+        f"truth: pairing accuracy {number('pairing_accuracy')}, recall {number('recall')}, "
+        f"UDR {number('udr')} (at most {number('udr_ceiling')}), "
+        f"trajectories right {number('trajectories_right')}, identity switches {truth['identity_switches']}"
+    ]
+    position = truth.get("position_mm", {}).get("right_pairs", {})
+    if position.get("count"):
+        nees = truth["position_mm"]["nees_over_3"]
+        lines.append(
+            f"       3D error {position['mean']:.1f} mm mean, {position['median']:.1f} mm median"
+            + ("" if nees is None else f", NEES/3 {nees:.2f}")
+        )
+    return lines
