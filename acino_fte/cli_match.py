@@ -40,9 +40,9 @@ def match(
         Path,
         typer.Argument(
             metavar="FOLDER",
-            help="A folder with the cameras (cameras.json, .toml, .xcp, dltCoefs.csv) and the 2D tracks of each "
-            "(cam0.csv, cam1.csv … with frame, track, x, y; DLTdv xypts; TRex, idtracker.ai, SLEAP exports); or "
-            "the file with the tracks of all cameras.",
+            help="A folder with the cameras (cameras.json, .toml, .xcp, dltCoefs.csv) and the 2D tracks of "
+            "each (cam0.csv, cam1.csv … with frame, track, x, y; DLTdv xypts; TRex, idtracker.ai, SLEAP "
+            "exports); or the file with the tracks of all cameras.",
             show_default=False,
         ),
     ],
@@ -127,7 +127,8 @@ def match(
     encounter: Annotated[
         float,
         typer.Option(
-            help="Animals closer than this in a view may have been exchanged, standard deviations of the noise.",
+            help="Animals closer than this in a view, in standard deviations of the noise, may have been "
+            "exchanged.",
             rich_help_panel=_MATCHING,
         ),
     ] = 4.0,
@@ -193,9 +194,10 @@ def match(
 ) -> None:
     """Find out which dot is which animal in all cameras of a FOLDER, and rebuild their 3D tracks.
 
-    Writes observations.csv (the animal of every row of the input), tracks_3d.csv, matches.csv, metrics.json, the
-    layouts of movement and DLTdv, figures and a report. Leaves with 0 when animals were matched, 2 when the
-    input is wrong, 1 for anything else (also when nothing could be matched; that is saved).
+    Writes observations.csv (the animal of every row of the input),
+    tracks_3d.csv, matches.csv, metrics.json, the layouts of movement and
+    DLTdv, figures and a report. Leaves with 0 when animals were matched, 2 when
+    the input is wrong, 1 for anything else (and when nothing could be matched).
 
     Example: acino-fte match recording/ --fps 30 -o out/birds
     """

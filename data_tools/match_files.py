@@ -1,4 +1,4 @@
-"""A matching on disk: tables, the layouts of other programs, numbers and figures in one folder, whole or absent."""
+"""A matching on disk: tables, layouts of other programs, numbers and figures; a folder whole or absent."""
 
 from __future__ import annotations
 
@@ -55,6 +55,7 @@ def save_matches(
     Parameters
     ----------
     matches : TrackMatches
+        Of either method.
     folder : Path
         An earlier matching there is replaced.
     method : dict, optional

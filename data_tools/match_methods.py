@@ -28,6 +28,7 @@ def thesis_matches(
     recording : TrackRecording
         Two views or more.
     options : ThesisOptions, optional
+        By default the thesis's Set 2.
     progress : callable, optional
         Called with the name of every step.
 

@@ -25,6 +25,7 @@ def match_metrics(matches: TrackMatches, points: SpacePoints, method: dict[str, 
     Parameters
     ----------
     matches : TrackMatches
+        Of either method.
     points : SpacePoints
         Of :func:`~acino_fte.data_tools.match_points.space_points`.
     method : dict
@@ -159,9 +160,9 @@ def truth_metrics(matches: TrackMatches, points: SpacePoints) -> dict[str, Any] 
 def _space_errors(matches: TrackMatches, points: SpacePoints) -> dict[str, Any]:
     """Distance of the points in space from the truth, by source.
 
-    ``right_pairs`` are points that two views or more see, all with dots of one animal; NEES is their mean squared
-    error in units of their covariance, 3 when that is right (Bar-Shalom, Li and Kirubarajan 2001, eq. 5.4.2-9).
-    A point between belongs to the animal of most dots of its group.
+    ``right_pairs`` are points that two views or more see, all with dots of one animal; NEES is their mean
+    squared error in units of their covariance, 3 when that is right (Bar-Shalom, Li and Kirubarajan 2001,
+    section 5.4.2). A point without dots belongs to the animal of most dots of its group.
     """
     animal, agree = _animals(matches, points)
     truth = matches.recording.truth_3d
@@ -186,7 +187,7 @@ def _space_errors(matches: TrackMatches, points: SpacePoints) -> dict[str, Any]:
 
 
 def _animals(matches: TrackMatches, points: SpacePoints) -> tuple[np.ndarray, np.ndarray]:
-    """The true animal of every point, (T,), −1 for clutter; and whether all its dots are of that one, (T,)."""
+    """True animal of every point, (T,), −1 for clutter; whether all its dots are of that one, (T,)."""
     low = np.full(len(points), np.iinfo(np.int64).max)
     high = np.full(len(points), -1)
     votes = []

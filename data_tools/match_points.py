@@ -1,7 +1,7 @@
 """Points in space of a matching, and how far its dots are from them and from each other's epipolar planes.
 
-A matching whose 3D paths were followed has smooth ones; any other has the points where the rays of the matched
-dots meet. Shapes: T points in space, P rows of one view, K pairs of rows, V views.
+A matching whose 3D paths were followed has smooth ones; any other has the points where the rays of the
+matched dots meet. Shapes: T points in space, P rows of one view, K pairs of rows, V views.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def _of_paths(paths: Trajectories) -> SpacePoints:
 
 
 def _triangulated(matches: TrackMatches) -> SpacePoints:
-    """Each animal in each frame by itself; the covariance is that of least squares with the matching's noise."""
+    """Each animal in each frame by itself, with the covariance of least squares at the matching's noise."""
     recording = matches.recording
     views, n_views = recording.views, len(recording.views)
     keep = [group >= 0 for group in matches.groups]
@@ -192,7 +192,7 @@ def matched_pairs(matches: TrackMatches, a: int, b: int) -> tuple[np.ndarray, np
         key, first = np.unique(group[use] * span + view.frame[use] - low, return_index=True)
         rows.append(use[first])
         keys.append(key)
-    _, in_a, in_b = np.intersect1d(*keys, assume_unique=True, return_indices=True)
+    _, in_a, in_b = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
     return rows[0][in_a], rows[1][in_b]
 
 

@@ -35,8 +35,8 @@ def observations_table(matches: TrackMatches) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        group (empty when unmatched), confidence, camera, frame, track (empty for a bare point), x, y (px, y from
-        the top; empty for a row without a dot).
+        group (empty when unmatched), confidence, camera, frame, track (empty for a bare point), x, y (px, y
+        from the top; empty for a row without a dot).
     """
     parts = []
     for view, group, sure in zip(matches.recording.views, matches.groups, matches.confidence, strict=True):
@@ -90,9 +90,9 @@ def matches_table(matches: TrackMatches) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        group, camera, track, piece, first, last (frames, both included), n_dots, confidence (mean of the dots),
-        rival_group (the most likely other one; empty for none), rival_probability; sorted by group, camera and
-        first frame.
+        group, camera, track, piece, first, last (frames, both included), n_dots, confidence (mean of the
+        dots), rival_group (the most likely other one; empty for none), rival_probability; sorted by group,
+        camera and first frame.
     """
     parts = []
     for k, view in enumerate(matches.recording.views):
@@ -144,9 +144,9 @@ def movement_dataset(matches: TrackMatches, points: SpacePoints) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        ``position`` (time, space, keypoints, individuals), m; ``confidence`` (time, keypoints, individuals), the
-        mean of the animal's matched dots in the frame; ``position_sd`` like position. One keypoint, ``centroid``.
-        Time is in seconds when the frame rate is known (frame / fps), else in frames.
+        ``position`` (time, space, keypoints, individuals), m; ``confidence`` (time, keypoints, individuals),
+        the mean of the animal's matched dots in the frame; ``position_sd`` like position. One keypoint,
+        ``centroid``. Time is in seconds when the frame rate is known (frame / fps), else in frames.
     """
     import xarray as xr
 
