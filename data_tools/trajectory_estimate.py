@@ -12,6 +12,8 @@ from acino_fte.data_tools.trajectory_motion import N_LAGS, MotionModel, Pieces, 
 from acino_fte.data_tools.trajectory_smoother import ChainFactor
 
 _WINDOW, _SAMPLE = 50, 1500  # frames in a window, nodes to estimate the prior from
+_BROAD = np.array([2.0, 1.5, 1.5])  # standard deviations of log q and atanh r before any data
+_FEW = 10  # frames below which the moments say nothing
 _FLAT = 0.005  # gradient at which the search ends, about the error of log q
 _REACH = 3.5  # largest inverse hyperbolic tangent of a partial autocorrelation
 
@@ -29,6 +31,8 @@ def estimate_motion(
 
         −2 log p(pixels) = min_x (χ²(pixels) + xᵀP x) + log det(Λ + P) − log det P + const.
 
+    A broad normal law of log q and of atanh r decides where a few frames cannot.
+
     Parameters
     ----------
     x : (T, 3)
@@ -40,8 +44,10 @@ def estimate_motion(
     start : MotionModel, optional
         Where to begin; by default from the moments of the displacements.
     """
-    scale = max(float(np.ptp(x, axis=0).max()), 1e-6)
-    first = start or _from_moments(x, information, pieces)
+    noise = _noise(information)
+    scale = max(float(np.ptp(x, axis=0).max()), 100.0 * noise, 1e-6)
+    first = start or _from_moments(x, noise, information, pieces)
+    centre = np.array([np.log(3.0 * noise + 1e-6 * scale), 0.0, 0.0])
 
     def value(parameters: np.ndarray) -> float:
         motion = _motion(parameters, scale)
@@ -49,7 +55,8 @@ def estimate_motion(
             evidence = log_evidence(x, information, gradient, pieces, motion)
         except np.linalg.LinAlgError:
             return np.inf
-        return -evidence / (3.0 * pieces.n_nodes)  # curvature about 1 for log q
+        penalty = 0.5 * (((parameters - centre) / _BROAD) ** 2).sum()
+        return (penalty - evidence) / (3.0 * pieces.n_nodes)  # curvature about 1 for log q
 
     begin = np.array([np.log(first.step), *np.arctanh(np.clip(first.memory, -0.99, 0.99))])
     found = minimize(value, begin, method="BFGS", options={"gtol": _FLAT, "eps": 1e-3, "maxiter": 25})
@@ -94,24 +101,28 @@ def _count_up(counts: np.ndarray) -> np.ndarray:
     return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-def _from_moments(x: np.ndarray, information: np.ndarray, pieces: Pieces) -> MotionModel:
+def _noise(information: np.ndarray) -> float:
+    """Typical standard deviation of a coordinate that the views alone leave, m."""
+    trace = np.trace(information, axis1=1, axis2=2)
+    seen = trace > 0
+    if not seen.any():
+        return 0.0
+    sure = np.linalg.inv(information[seen] + 1e-6 * trace[seen, None, None] * np.eye(3))
+    return float(np.sqrt(np.median(np.trace(sure, axis1=1, axis2=2)) / 3.0))
+
+
+def _from_moments(x: np.ndarray, noise: float, information: np.ndarray, pieces: Pieces) -> MotionModel:
     """A rough prior from the covariances of displacements, less what the pixels' noise adds to them."""
-    step = np.diff(x, axis=0, prepend=x[:1])
     determinant = np.linalg.det(information)
-    met = (
-        determinant > 1e-3 * np.median(determinant[determinant > 0])
-        if (determinant > 0).any()
-        else determinant > 0
-    )
+    met = determinant > 0.01 * np.quantile(determinant, 0.9)  # a single view leaves its ray's direction open
     inner = (pieces.age >= N_LAGS) & met
     for lag in range(1, N_LAGS + 1):
         inner[lag:] &= met[:-lag]
-    eye = 1e-6 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    sure = np.linalg.inv(information + eye + 1e-12 * np.eye(3))
-    noise = float(np.median(np.trace(sure, axis1=1, axis2=2))) / 3.0
-    lagged = [float(np.mean((step[lag:] * step[: len(step) - lag])[inner[lag:]])) if inner.any() else 0.0
-              for lag in range(3)]  # fmt: skip
-    g0 = max(lagged[0] - 2 * noise, 0.05 * lagged[0], 1e-8)
-    r1 = float(np.clip((lagged[1] + noise) / g0, -0.5, 0.98))
-    r2 = float(np.clip((lagged[2] / g0 - r1**2) / (1 - r1**2), -0.8, 0.8))
-    return MotionModel(float(np.sqrt(g0 * (1 - r1**2) * (1 - r2**2))), (r1, r2))
+    if inner.sum() < _FEW:
+        return MotionModel(3.0 * noise + 1e-6)
+    step = np.diff(x, axis=0, prepend=x[:1])
+    g0, g1, g2 = (float(np.mean((step[lag:] * step[: len(step) - lag])[inner[lag:]])) for lag in range(3))
+    own = max(g0 - 2 * noise**2, 0.05 * g0, 1e-12)
+    r1 = float(np.clip((g1 + noise**2) / own, -0.5, 0.98))
+    r2 = float(np.clip((g2 / own - r1**2) / (1 - r1**2), -0.8, 0.8))
+    return MotionModel(float(np.sqrt(own * (1 - r1**2) * (1 - r2**2))), (r1, r2))

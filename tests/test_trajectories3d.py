@@ -352,6 +352,16 @@ def test_groups_of_one_view_and_rows_without_a_group_have_no_path():
     assert not result.wrong[0][first.group == 30].any()
 
 
+def test_a_few_frames_leave_the_prior_broad():
+    recording = simulate_tracks(TrackSimulation(n_animals=1, n_frames=3, motion="smooth", seed=1))
+    for n in (1, 2, 3):
+        views = [ViewRows(v.frame[:n], v.xy[:n], v.group[:n]) for v in rows_of(recording)]
+        result = smooth_trajectories(recording.cameras, views, 3.0, extend=1)
+        assert len(result) == n + 2
+        spread = np.trace(result.covariance, axis1=1, axis2=2)
+        assert spread[-1] > 1.5 * spread[-2]  # the next frame is hardly known
+
+
 def test_no_rows_no_paths():
     empty = ViewRows(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0, dtype=int))
     result = smooth_trajectories(thesis_rig(), [empty, empty], 3.0)
