@@ -28,6 +28,12 @@ rows of camera 1 pass every gate; z is the world's. One is not kept: the code un
 here both are undistorted. Where the code compares coordinates to about 0.1 px to find a dot again, here the
 dot is known.
 
+On the thesis's own 20 animals one draw of the noise differs from another by 0.003 (3 px) to 0.005 (5 px) in
+accuracy, and in the used-data ratio by 0.003 in Set 1, 0.001 in Set 2, 0.008 in Set 3 (one standard
+deviation). The numbers measured with the code, of how many draws is not known, lie within about two such
+deviations of the mean here but for two: the used-data ratio of Set 1 at 5 px (0.802, here 0.810) and the
+accuracy of Set 2 at 3 px (0.885, here 0.876).
+
 With more than two cameras, the first is paired with each of the others.
 """
 
