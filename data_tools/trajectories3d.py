@@ -7,7 +7,8 @@ Every group of 2D rows is one animal. Its path x_1 … x_N minimises
 where w_f is what is new in the displacement of frame f (:mod:`trajectory_motion`). The prior (q and the
 memory of the displacements) has the greatest marginal likelihood of the pixels; all groups share it. A row
 is wrong when it lies further from what all other rows of its group predict than the gate; the worst row of a
-neighbourhood leaves first. Frames that one view sees are held by the prior, short gaps are filled, long
+neighbourhood leaves first. Where rows leave in a crowd, as in a sudden flight, the innovations have heavy
+tails instead. Frames that one view sees are held by the prior, short gaps are filled, long
 ones split the path. Covariances are those of Laplace's approximation at the most probable path.
 
 Shapes: T path points (sorted by group, then frame), P rows of a view, C cameras.

@@ -5,19 +5,27 @@ Shapes: T nodes, P rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from acino_fte.data_tools.trajectory_estimate import estimate_motion, sample_windows
-from acino_fte.data_tools.trajectory_motion import MotionModel, Pieces
+from acino_fte.data_tools.trajectory_motion import (
+    MotionModel,
+    Pieces,
+    innovations,
+    tail_weights,
+)
 from acino_fte.data_tools.trajectory_rows import Measurements
 from acino_fte.data_tools.trajectory_smoother import ChainFactor
 
 _MIN_SINE2 = np.sin(np.radians(1.0)) ** 2
+_MIN_HEAVY = 4  # steps with heavy tails
 _MAX_STEPS, _DONE = 8, 0.5  # Gauss–Newton; the last step moves no pixel by more than this part of σ
 _ALONE = 1e-3  # keeps rows that nothing else predicts from being judged by rounding errors
-_ROUNDS, _ESTIMATES = 12, 3
+_ROUNDS, _HEAVY_ROUNDS, _ESTIMATES = 12, 3, 3
+_CROWD, _CROWD_FRAMES = 4, 5  # rows that leave within so many frames are a crowd
+_TAILS = 3.0  # degrees of freedom of heavy tails
 _BATCH = 30_000  # nodes fitted at once
 _NEIGHBOURS = 2  # frames before and after in which only the worst row leaves
 _DOUBT = 30.0  # squared residual of a frame's rows, in σ², beyond which they do not count at first
@@ -88,16 +96,71 @@ def fit_paths(
 def _settled(
     rows: Measurements, pieces: Pieces, points: np.ndarray, motion: MotionModel, gate: float
 ) -> PathFit:
-    """Fit with a given prior until no row leaves or returns."""
+    """Fit with a given prior until no row leaves or returns.
+
+    A sudden flight makes many right rows in a row look wrong; wrong rows are scattered. Pieces from which
+    rows leave in a crowd are fitted again with all rows and heavy tails, which forgive a rare large
+    innovation. That counts where it spares half of the rows; a group of two animals stays as it was.
+    """
     start = bridge(points, pieces)
     linear = rows.linearise(start)
     fit = _fit(rows, pieces, start, ~_doubtful(rows, linear[0], points), motion, linear)
-    for _ in range(_ROUNDS):
-        used = _judge(fit, rows, pieces, gate)
-        if (used == fit.used).all():
-            break
-        fit = _refit(fit, rows, pieces, used)
+    everywhere = np.ones(len(pieces.length), dtype=bool)
+    fit = _rounds(fit, rows, pieces, motion, gate, everywhere, _ROUNDS)
+    crowded = _crowded(rows.node[~fit.used], pieces)
+    if crowded.any() and not np.isfinite(motion.tails):
+        heavy = replace(motion, tails=_TAILS)
+        used = fit.used | crowded[pieces.owner[rows.node]]
+        other = _refit(fit, rows, pieces, used, crowded, heavy)
+        other = _rounds(other, rows, pieces, heavy, gate, crowded, _HEAVY_ROUNDS)
+        fit = _better(fit, other, rows, pieces)
     return fit
+
+
+def _better(fit: PathFit, other: PathFit, rows: Measurements, pieces: Pieces) -> PathFit:
+    """Of each piece the other fit if it takes half as many rows for wrong, or fewer."""
+    owner, n = pieces.owner, len(pieces.length)
+    lost, lost_other = (np.bincount(owner[rows.node[~one.used]], minlength=n) for one in (fit, other))
+    take = 2 * lost_other < lost
+    at_node, at_row = take[owner], take[owner[rows.node]]
+
+    def pick(key: str, where: np.ndarray) -> np.ndarray:
+        mine, theirs = getattr(fit, key), getattr(other, key)
+        return np.where(where.reshape(-1, *[1] * (mine.ndim - 1)), theirs, mine)
+
+    nodes = {key: pick(key, at_node) for key in ("x", "covariance")}
+    return PathFit(
+        motion=fit.motion, **nodes, **{key: pick(key, at_row) for key in ("used", "distance", "residual")}
+    )
+
+
+def _rounds(
+    fit: PathFit,
+    rows: Measurements,
+    pieces: Pieces,
+    motion: MotionModel,
+    gate: float,
+    where: np.ndarray,
+    n_rounds: int,
+) -> PathFit:
+    """Let rows leave and return in some pieces, (S,) bool, until none does."""
+    mine = where[pieces.owner[rows.node]]
+    for _ in range(n_rounds):
+        used = np.where(mine, _judge(fit, rows, pieces, gate), fit.used)
+        changed = np.bincount(pieces.owner[rows.node[used != fit.used]], minlength=len(pieces.length)) > 0
+        if not changed.any():
+            break
+        fit = _refit(fit, rows, pieces, used, changed, motion)
+    return fit
+
+
+def _crowded(node: np.ndarray, pieces: Pieces) -> np.ndarray:
+    """Pieces (S,) with many of the given nodes (one for each wrong row) within a few frames."""
+    total = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=pieces.n_nodes))])
+    crowd = total[_CROWD_FRAMES:] - total[:-_CROWD_FRAMES] >= _CROWD
+    owner = pieces.owner
+    inside = owner[: len(crowd)] == owner[_CROWD_FRAMES - 1 :]
+    return np.bincount(owner[: len(crowd)][crowd & inside], minlength=len(pieces.length)) > 0
 
 
 def _estimated(rows: Measurements, pieces: Pieces, points: np.ndarray, gate: float) -> MotionModel:
@@ -117,9 +180,9 @@ def _estimated(rows: Measurements, pieces: Pieces, points: np.ndarray, gate: flo
         fit = _settled(rows, windows, points, motion, gate)
         if (fit.used == used).all():
             break
-        used = fit.used
-        at_path = rows.information(*rows.linearise(fit.x), used, len(x))
-        motion = estimate_motion(fit.x, *at_path, windows, motion)
+        used, x = fit.used, fit.x
+        at_path = rows.information(*rows.linearise(x), used, len(x))
+        motion = estimate_motion(x, *at_path, windows, motion)
     return motion
 
 
@@ -154,18 +217,21 @@ def _fit(
     motion: MotionModel,
     linear: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> PathFit:
-    x, factor, residual, slope = improve(rows, used, start, pieces, motion, linear)
-    covariance = factor.covariance()
+    x, covariance, residual, slope = improve(rows, used, start, pieces, motion, linear)
     distance = deleted_distance(residual, slope, used, rows.variance, covariance[rows.node])
     return PathFit(x, covariance, used, distance, residual, motion)
 
 
-def _refit(fit: PathFit, rows: Measurements, pieces: Pieces, used: np.ndarray) -> PathFit:
-    """Fit the pieces again in which rows left or returned."""
-    piece = pieces.owner
-    changed = np.zeros(len(pieces.length), dtype=bool)
-    changed[piece[rows.node[used != fit.used]]] = True
-    at_node, at_row = changed[piece], changed[piece[rows.node]]
+def _refit(
+    fit: PathFit,
+    rows: Measurements,
+    pieces: Pieces,
+    used: np.ndarray,
+    changed: np.ndarray,
+    motion: MotionModel,
+) -> PathFit:
+    """Fit some of the pieces again, (S,) bool, with other rows and another prior."""
+    at_node, at_row = changed[pieces.owner], changed[pieces.owner[rows.node]]
     chosen = np.flatnonzero(at_row)
     new_node = np.cumsum(at_node) - 1
     part = _fit(
@@ -173,7 +239,7 @@ def _refit(fit: PathFit, rows: Measurements, pieces: Pieces, used: np.ndarray) -
         Pieces(pieces.length[changed]),
         fit.x[at_node],
         used[chosen],
-        fit.motion,
+        motion,
     )
     whole = {key: getattr(fit, key).copy() for key in ("x", "covariance", "distance", "residual")}
     for key in ("x", "covariance"):
@@ -220,11 +286,12 @@ def improve(
     pieces: Pieces,
     motion: MotionModel,
     linear: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[np.ndarray, ChainFactor, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Gauss–Newton steps to the most probable paths.
 
-    Returns the paths (T, 3), the factor of the last step, and there the residuals (P, 2) and the derivatives
-    (P, 2, 3) of the predictions.
+    With heavy tails every step also renews the weights of the innovations (expectation–maximisation).
+    Returns the paths (T, 3), their covariances (T, 3, 3), the residuals (P, 2) and the derivatives (P, 2, 3)
+    of the predictions.
 
     Parameters
     ----------
@@ -242,17 +309,26 @@ def improve(
         What :meth:`Measurements.linearise` gives at x, if it is known.
     """
     sigma = np.sqrt(measurements.variance)
-    for _ in range(_MAX_STEPS):
+    heavy, weight = np.isfinite(motion.tails), None
+    for number in range(_MAX_STEPS):
         residual, slope = linear or measurements.linearise(x)
         linear = None
         information, gradient = measurements.information(residual, slope, used, len(x))
-        factor = ChainFactor(information, motion, pieces)
+        factor = ChainFactor(information, motion, pieces, weight)
         step = factor.solve(gradient - factor.prior_times(x))
         x = x + step
         moved = (slope * step[measurements.node][:, None]).sum(2)
-        if not np.nanmax(np.abs(moved) * (used / sigma)[:, None], initial=0.0) > _DONE:
+        covariance, squared = factor.covariance_and_spread() if heavy else (None, None)
+        if not np.nanmax(np.abs(moved) * (used / sigma)[:, None], initial=0.0) > _DONE and not (
+            heavy and number < _MIN_HEAVY
+        ):
             break
-    return x, factor, residual - moved, slope
+        if heavy:
+            squared += (innovations(motion, pieces, x) ** 2).sum(1)
+            weight = tail_weights(motion, pieces, squared)
+    if covariance is None:
+        covariance = factor.covariance()
+    return x, covariance, residual - moved, slope
 
 
 def deleted_distance(

@@ -36,10 +36,14 @@ class MotionModel:
         q, standard deviation of what is new in the displacement of a frame, each axis, m.
     memory : (float, float)
         r_1 and r_2, the partial autocorrelations of the displacements.
+    tails : float
+        ν: the innovations follow Student's law with ν degrees of freedom and scale q; infinite: the normal
+        law. Animals that sit and now and then fly have a small ν.
     """
 
     step: float
     memory: tuple[float, float] = (0.0, 0.0)
+    tails: float = np.inf
 
     @property
     def coefficients(self) -> np.ndarray:
@@ -128,6 +132,18 @@ def innovations(motion: MotionModel, pieces: Pieces, x: np.ndarray) -> np.ndarra
     for lag in range(1, N_LAGS + 1):
         out[lag:] += c[lag:, lag, None] * x[:-lag]
     return out
+
+
+def tail_weights(motion: MotionModel, pieces: Pieces, squared: np.ndarray) -> np.ndarray:
+    """Expected factor on the information of each innovation, given its expected square (T,), m².
+
+    Student's law is a normal law of random precision; this is the expectation of the precision
+    (Lange, Little and Taylor 1989): (ν + 3) / (ν + w²/q²). One where a piece begins unless it is small.
+    """
+    if not np.isfinite(motion.tails):
+        return np.ones(len(squared))
+    weight = (motion.tails + 3.0) / (motion.tails + squared / motion.variances[pieces.age])
+    return np.where(pieces.age == N_LAGS, weight, np.where(pieces.age == 0, 1.0, np.minimum(weight, 1.0)))
 
 
 def log_information(motion: MotionModel, pieces: Pieces) -> float:

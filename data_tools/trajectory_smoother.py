@@ -49,6 +49,7 @@ class ChainFactor:
         weight: np.ndarray | None = None,
     ) -> None:
         self._pieces = pieces
+        self._coefficients, self._tails = motion.coefficients[N_LAGS], motion.tails
         n = pieces.n_nodes
         self._prior = prior_band(motion, pieces, weight)
         band = np.zeros((n, 3, _NEXT + 3))  # LAPACK's columns: one per coordinate, its diagonal first
@@ -81,11 +82,18 @@ class ChainFactor:
 
     def covariance(self) -> np.ndarray:
         """Σ_tt of every node, (T, 3, 3)."""
-        out = np.empty((self._pieces.n_nodes, 3, 3))
+        return self.covariance_and_spread()[0]
+
+    def covariance_and_spread(self) -> tuple[np.ndarray, np.ndarray]:
+        """Σ_tt of every node (T, 3, 3), and the variance of its innovation (T,), sum of the axes, m².
+
+        The variance is that of the fourth and later frames of a piece; zero for those before.
+        """
+        out, spread = np.empty((self._pieces.n_nodes, 3, 3)), np.zeros(self._pieces.n_nodes)
         order = np.argsort(-self._pieces.length, kind="stable")
         for part in np.array_split(order, max(1, self._pieces.n_nodes // 200_000)):
-            self._sweep(part, out)
-        return out
+            self._sweep(part, out, spread)
+        return out, spread
 
     def _columns(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """C (K, 9, 3) and (L_tt L_ttᵀ)⁻¹ (K, 3, 3) of nodes."""
@@ -96,8 +104,8 @@ class ChainFactor:
         inverse = _inverse_lower(full[:, :3])
         return full[:, 3:] @ inverse, inverse.transpose(0, 2, 1) @ inverse
 
-    def _sweep(self, chosen: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` for some pieces, given longest first."""
+    def _sweep(self, chosen: np.ndarray, out: np.ndarray, spread: np.ndarray) -> None:
+        """Fill `out` and `spread` for some pieces, given longest first."""
         length = self._pieces.length[chosen]
         last = self._pieces.start[chosen] + length - 1
         active = np.searchsorted(-length, -np.arange(length.max(initial=0)), side="left")
@@ -106,7 +114,10 @@ class ChainFactor:
         c, own = self._columns(nodes)
         window = np.zeros((len(chosen), _NEXT, _NEXT))
         begin = 0
-        for count in active:
+        later, now = self._coefficients[2::-1], self._coefficients[3]
+        pattern = np.kron(np.outer(later, later), np.eye(3))
+        beside = 2 * now * np.kron(later[:, None], np.eye(3))
+        for back, count in enumerate(active):
             at = slice(begin, begin + count)
             begin += count
             w = window[:count]
@@ -114,6 +125,10 @@ class ChainFactor:
             block = own[at] - c[at].transpose(0, 2, 1) @ cross
             block = 0.5 * (block + block.transpose(0, 2, 1))  # or rounding grows without bound
             out[nodes[at]] = block
+            if back >= N_LAGS and np.isfinite(self._tails):
+                total = now**2 * np.trace(block, axis1=1, axis2=2)
+                total += cross.reshape(count, -1) @ beside.ravel() + w.reshape(count, -1) @ pattern.ravel()
+                spread[nodes[at] + N_LAGS] = total
             shifted = np.empty_like(w)
             shifted[:, 3:, 3:] = w[:, :-3, :-3]
             shifted[:, :3, :3] = block

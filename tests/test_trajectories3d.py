@@ -105,6 +105,20 @@ def test_factor_against_dense_algebra():
     np.testing.assert_allclose(factor.prior_times(right).ravel(), prior @ right.ravel(), atol=1e-9)
 
 
+def test_variance_of_the_innovations_against_dense_algebra():
+    rng = np.random.default_rng(8)
+    pieces, motion = Pieces(np.array([9, 2, 6])), replace(MOTION, tails=4.0)
+    information, weight = some_information(17, rng), np.ones(17)
+    inverse = np.linalg.inv(dense_information(pieces, MOTION, information))
+    _, spread = ChainFactor(information, motion, pieces, weight).covariance_and_spread()
+    for t in range(17):
+        row = np.zeros(17)
+        if pieces.age[t] == 3:
+            row[t - 3 : t + 1] = motion.coefficients[3][::-1]
+        full = np.kron(row, np.eye(3))
+        assert spread[t] == pytest.approx(np.trace(full @ inverse @ full.T), abs=1e-10)
+
+
 @pytest.mark.parametrize("memory", [(0.96, -0.98), (0.999, 0.0), (0.6, 0.2)])
 def test_covariance_stays_exact_along_a_chain_that_is_hardly_seen(memory):
     """Without care the recursion multiplies rounding errors by 1e86 here."""
@@ -270,6 +284,23 @@ def test_wrong_rows_are_found_and_bend_nothing(rig):
     for flagged, wrong in zip(result.wrong, bad, strict=True):
         np.testing.assert_array_equal(flagged, wrong)
     assert scores(result, paths_of(recording))[0] < 1.05 * scores(clean, paths_of(recording))[0]
+
+
+def test_a_sudden_flight_is_no_crowd_of_wrong_rows():
+    """A bird that sits for minutes and flies for a third of a second: the prior knows sitting only."""
+    path = np.tile([[0.7, 0.1, 4.0]], (200, 1))
+    path[100:110] += np.linspace(0, 1, 10)[:, None] * [0.6, -0.3, 0.4]
+    path[110:] = path[109]
+    rng, cameras = np.random.default_rng(9), thesis_rig()
+    views = [
+        ViewRows(np.arange(200), camera.project(path) + rng.normal(size=(200, 2)), np.zeros(200, dtype=int))
+        for camera in cameras
+    ]
+    views[1].xy[40] += [50.0, -80.0]
+    result = smooth_trajectories(cameras, views, 1.0, motion=MotionModel(0.001))
+    assert not result.wrong[0].any() and list(np.flatnonzero(result.wrong[1])) == [40]
+    error = np.linalg.norm(result.position - path, axis=1)
+    assert error[:95].mean() < 0.003 and error.max() < 0.03
 
 
 def test_distance_is_that_from_the_path_without_the_row():
