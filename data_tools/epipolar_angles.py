@@ -21,7 +21,7 @@ import numpy as np
 
 from acino_fte.cameras import Camera, CameraArray
 
-_LEAST_BASELINE = 1e-6  # of the cameras' mean distance from the origin, or m
+_LEAST_BASELINE = 1e-9  # of the coordinates (georeferenced ones are large), or 1 nm
 _NEAR_EPIPOLE = 20.0  # times the median slope: there an angle says next to nothing
 
 
@@ -115,7 +115,7 @@ def _basis(a: Camera, b: Camera) -> np.ndarray | None:
     """(N or 1, 3, 3): rows e (baseline), e1 (where the cameras look), e2; NaN where the centres are one."""
     base = np.atleast_2d(b.centre - a.centre)
     length = np.linalg.norm(base, axis=1, keepdims=True)
-    scale = 1e-9 + _LEAST_BASELINE * max(float(np.abs(a.centre).mean()), 1.0)
+    scale = _LEAST_BASELINE * max(float(np.abs(a.centre).max()), 1.0)
     if not (length > scale).any():
         return None
     e = base / np.where(length > scale, length, np.nan)

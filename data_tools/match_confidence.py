@@ -13,9 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from acino_fte.data_tools.track_evidence import runs
 from acino_fte.data_tools.track_groups import PieceGraph
 
 _MOST = 700.0
+_IMPROBABLE = -40.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,8 @@ def confidence_of(graph: PieceGraph, label: np.ndarray) -> Confidence:
     own[piece[mine]] = gain[mine]
     joined = np.zeros(n, dtype=bool)
     joined[piece[mine]] = True
-    piece, group, gain = piece[~mine], group[~mine], gain[~mine]
+    other = ~mine & (gain - own[piece] > _IMPROBABLE)
+    piece, group, gain = piece[other], group[other], gain[other]
     change = gain - own[piece] + _displaced(graph, label, own, piece, group)
     odds = np.exp(np.clip(change, -_MOST, _MOST))
     against = np.exp(np.clip(-own, -_MOST, _MOST)) + np.bincount(piece, weights=odds, minlength=n)
@@ -85,7 +88,7 @@ def _displaced(
     low = np.searchsorted(label[by_group], group)
     count = np.searchsorted(label[by_group], group, side="right") - low
     offer = np.repeat(np.arange(len(piece)), count)
-    there = by_group[np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)]
+    there = by_group[runs(low, count)]
     comer = piece[offer]
     clash = (graph.view[there] == graph.view[comer]) & (
         np.minimum(graph.last[there], graph.last[comer]) >= np.maximum(graph.first[there], graph.first[comer])

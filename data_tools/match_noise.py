@@ -1,9 +1,11 @@
 """How far the dots of one animal are from one epipolar plane, from the recording itself.
 
 Before anything is matched: for some windows of 16 frames of the tracks of one view, the window of the other view
-that is nearest in all of them, provided it is within a wide reach in nearly all; the median of the mean squares. The
-reach is a share of the image's diagonal, made wider while it matters. After matching, the noise is that of the
-matched dots: σ from the change of d between frames next to each other in a chunk, σ_s from the means of chunks.
+that is nearest in all of them, provided it is within a wide reach in nearly all. Windows in which a track changes
+hands have no partner, or one by chance that is far off, so the noise is the lowest peak of the logarithms of the
+mean squares, and the reach, a share of the image's diagonal, is made wider until there is one well inside it.
+After matching, the noise is that of the matched dots: σ from the scatter of d about the mean of a chunk of frames,
+σ_s from what the means of the chunks scatter beyond that.
 """
 
 from __future__ import annotations
@@ -14,11 +16,14 @@ import numpy as np
 
 from acino_fte.data_tools.track_evidence import REACH, Dots, Evidence, Noise, gather_evidence
 
-_REACH = 0.02  # of the diagonal
-_WIDEST = 0.16
-_FEWEST, _ALWAYS = 8, 0.9
-_WINDOW, _WINDOWS = 16, 500
+_REACHES = (0.01, 0.02, 0.04, 0.08, 0.16)  # of the diagonal
+_FEWEST, _ALWAYS = (8, 4, 2, 1), 0.9  # frames that windows must share; fewer for very short recordings
+_WINDOW, _N_WINDOWS = 16, 500
+_TOO_FEW, _TENTH = 4, 0.1
+_PEAK = 2.0  # half width of a peak, in standard deviations of the logarithm of a mean square
 _LEAST_PX = 0.02
+_LEAST_SLOW = 0.03  # of the white noise
+_LEAST_DOTS = 8
 _SURE = 4.0  # standard errors by which the means of chunks must exceed the white noise
 _TRIM = 1.0 / 0.9988  # variance of a Gaussian cut off at four standard deviations
 
@@ -33,30 +38,47 @@ def first_noise(pairs: list[tuple[Dots, Dots]], diagonal: float) -> Noise | None
     diagonal : float
         Of the images, px.
     """
-    share = _REACH
-    while True:
-        reach = share * diagonal
-        found = [_best_partners(a, b, reach) for a, b in pairs]
-        squares = np.concatenate(found) if found else np.empty(0)
-        if len(squares):
-            noise = float(np.sqrt(np.median(squares)))
-            if noise < reach / 5 or share >= _WIDEST:
-                return Noise(max(noise, _LEAST_PX), 0.0)
-        elif share >= _WIDEST:
+    for fewest in _FEWEST:
+        for share in _REACHES:
+            reach = share * diagonal
+            found = [_best_partners(a, b, reach, fewest) for a, b in pairs]
+            noise = _lowest_peak(np.concatenate(found), fewest) if found else None
+            if noise is not None and noise < reach / 5:
+                return _noise(noise, 0.0)
+    return None
+
+
+def _lowest_peak(squares: np.ndarray, n_dots: int) -> float | None:
+    """Root of the mean squares about which the lowest tenth of the windows gather; None for too few windows.
+
+    The median of a mean of n squares is (1 − 2/9n)³ of the variance (Wilson and Hilferty 1931).
+    """
+    if len(squares) < _TOO_FEW:
+        return None
+    level = np.sort(np.log(np.maximum(squares, _LEAST_PX**2 / 4)))
+    width = _PEAK * np.sqrt(2.0 / n_dots)
+    count = np.searchsorted(level, level + 2 * width, side="right") - np.arange(len(level))
+    centre = level[np.argmax(count >= max(_TOO_FEW, _TENTH * len(level)))] + width
+    for _ in range(10):
+        inside = np.abs(level - centre) <= width
+        if not inside.any():
             return None
-        share *= 2
+        centre = float(np.median(level[inside]))
+    return float(np.exp(0.5 * centre) / (1.0 - 2.0 / (9.0 * n_dots)) ** 1.5)
 
 
-def _best_partners(a: Dots, b: Dots, reach: float) -> np.ndarray:
+def _best_partners(a: Dots, b: Dots, reach: float, fewest: int) -> np.ndarray:
     """Mean d² of some windows of pieces of a with the nearest window of b."""
     a, b = _windows(a), _windows(b)
+    if not a.n_pieces or not b.n_pieces:
+        return np.empty(0)
     length = np.bincount(a.piece[a.piece >= 0], minlength=a.n_pieces)
-    long = np.flatnonzero(length >= _FEWEST)
+    long = np.flatnonzero(length >= fewest)
     some = np.zeros(a.n_pieces, dtype=bool)
-    some[long[:: max(1, len(long) // _WINDOWS)]] = True
+    some[long[:: max(1, len(long) // _N_WINDOWS)]] = True
     part = replace(a, piece=np.where((a.piece >= 0) & some[a.piece], a.piece, -1))
-    e = gather_evidence(part, b, Noise(reach / REACH))
-    good = (e.shared >= _FEWEST) & (e.near >= _ALWAYS * e.shared)
+    e = gather_evidence(part, b, Noise(reach / REACH), prune=False)
+    good = (e.shared >= fewest) & (e.near >= _ALWAYS * e.shared)
     best = np.full(a.n_pieces, np.inf)
     np.minimum.at(best, e.a[good], e.squares[good] / e.near[good])
     return best[np.isfinite(best)]
@@ -84,16 +106,22 @@ def matched_noise(evidence: list[Evidence], partners: list[np.ndarray], before: 
         What the evidence was gathered with.
     """
     near = sum(e.near[p].sum() for e, p in zip(evidence, partners, strict=True))
-    if near < _FEWEST:
+    if near < _LEAST_DOTS:
         return before
     squares = sum(e.squares[p].sum() for e, p in zip(evidence, partners, strict=True))
     means = sum((e.squared_means[p]).sum() for e, p in zip(evidence, partners, strict=True))
     chunks = sum(e.chunks[p].sum() for e, p in zip(evidence, partners, strict=True))
-    if near - chunks < _FEWEST:
-        return Noise(max(float(np.sqrt(squares / near * _TRIM)), _LEAST_PX), 0.0)
+    if near - chunks < _LEAST_DOTS:
+        return _noise(float(np.sqrt(squares / near * _TRIM)), 0.0)
     within = (squares - means) / (near - chunks)
     white = float(np.sqrt(within * _TRIM))
     excess = means - chunks * within
     sure = excess > _SURE * within * np.sqrt(2.0 * chunks)
     slow = float(np.sqrt(excess / near)) if sure else 0.0
-    return Noise(max(white, _LEAST_PX), slow)
+    return _noise(white, slow)
+
+
+def _noise(white: float, slow: float) -> Noise:
+    """No noise is nought, and no calibration is perfect."""
+    white = max(white, _LEAST_PX)
+    return Noise(white, max(slow, _LEAST_SLOW * white))

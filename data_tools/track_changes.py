@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from acino_fte.data_tools.track_evidence import REACH, Dots, Noise, log_chance, memories, near_dots
+from acino_fte.data_tools.track_pieces import belongs
 
 CHANGE = 12.0
 """Log-odds that a change of partner must bring."""
@@ -39,7 +40,7 @@ def find_changes(
         The frame is the first after the change.
     """
     a, b = pair[side], pair[1 - side]
-    rows = np.flatnonzero((a.piece >= 0) & doubtful[a.piece] & np.isfinite(a.angles.angle))
+    rows = np.flatnonzero(belongs(a.piece, doubtful) & np.isfinite(a.angles.angle))
     rows = rows[np.argsort(a.piece[rows], kind="stable")]
     pieces = np.unique(a.piece[rows])
     start = np.searchsorted(a.piece[rows], pieces)

@@ -1,7 +1,7 @@
 """3D paths drop the dots that do not belong to them, and claim loose ones.
 
-A dot that lies further from what all other dots of its animal predict than noise allows leaves it. A dot that no
-animal has, because a detector lost it in an encounter or its piece was too short to decide, goes to the animal
+A piece of track that lies further from what all other dots of its animal predict than noise allows leaves it; the
+paths of one animal on both sides of a gap are joined (:mod:`track_joins`). A dot that no animal has, because a detector lost it in an encounter or its piece was too short to decide, goes to the animal
 whose path runs through it: with the squared distance z from the predicted pixel, the determinant |S| of its
 covariance and the density ρ of loose dots, the odds of the pair are exp(−z/2)/(2π √|S| ρ); in every frame and view
 the claims are settled together, and one that another claim makes uncertain is left.
@@ -13,15 +13,23 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from acino_fte.data_tools.trajectories3d import Trajectories, smooth_trajectories
+from acino_fte.data_tools.track_evidence import runs
+from acino_fte.data_tools.track_joins import join_paths
+from acino_fte.data_tools.trajectories3d import SOURCES, Trajectories, smooth_trajectories
 from acino_fte.data_tools.trajectory_rows import ViewRows
 
 if TYPE_CHECKING:
     from acino_fte.data_tools.track_matching import TrackMatches
+    from acino_fte.data_tools.trajectory_motion import MotionModel
 
 _GATE = 16.0
-_MOST_TO_FRAME = 4096
+_BEYOND = 8
+_NEVER = 1e3
+_SURE = 0.9
 
 
 def claim_loose_dots(matches: TrackMatches, max_gap: int) -> TrackMatches:
@@ -33,16 +41,19 @@ def claim_loose_dots(matches: TrackMatches, max_gap: int) -> TrackMatches:
     max_gap : int
         Longest gap that a path bridges, frames.
     """
-    paths = _paths(matches, max_gap)
-    dropped = _without_wrong(matches, paths)
-    claimed = _with_claims(dropped, paths)
-    if any(not np.array_equal(a, b) for a, b in zip(matches.groups, claimed.groups, strict=True)):
-        paths = _paths(claimed, max_gap)
-        claimed = _without_wrong(claimed, paths)
-    return replace(claimed, trajectories=paths)
+    paths = _paths(matches, max_gap, min(max_gap, _BEYOND))
+    kept = _without_strangers(matches, paths)
+    group = np.append(join_paths(paths, kept, max_gap), -1)
+    claimed = _with_claims(kept, paths)
+    joined = replace(claimed, groups=tuple(group[g] for g in claimed.groups), rival=group[claimed.rival])
+    same = all(np.array_equal(a, b) for a, b in zip(matches.groups, joined.groups, strict=True))
+    paths = _without_extension(paths) if same else _paths(joined, max_gap, motion=paths.motion)
+    return replace(joined, trajectories=paths)
 
 
-def _paths(matches: TrackMatches, max_gap: int) -> Trajectories:
+def _paths(
+    matches: TrackMatches, max_gap: int, extend: int = 0, motion: MotionModel | None = None
+) -> Trajectories:
     recording = matches.recording
     views = [
         ViewRows(view.frame, view.xy, group)
@@ -52,26 +63,48 @@ def _paths(matches: TrackMatches, max_gap: int) -> Trajectories:
         recording.cameras,
         views,
         matches.noise.total,
+        motion=motion,
         max_gap=max_gap,
+        extend=extend,
         first_frame=recording.first_frame,
     )
 
 
-def _without_wrong(matches: TrackMatches, paths: Trajectories) -> TrackMatches:
-    groups = tuple(np.where(w, -1, g) for w, g in zip(paths.wrong, matches.groups, strict=True))
-    sure = tuple(np.where(w, np.nan, c) for w, c in zip(paths.wrong, matches.confidence, strict=True))
-    return replace(matches, groups=groups, confidence=sure)
+def _without_extension(paths: Trajectories) -> Trajectories:
+    """The paths without the frames beyond their ends."""
+    inside = paths.source != SOURCES.index("extended")
+    names = ("group", "frame", "piece", "position", "covariance", "source", "n_views", "reprojection")
+    return replace(paths, **{name: getattr(paths, name)[inside] for name in names})
+
+
+def _without_strangers(matches: TrackMatches, paths: Trajectories) -> TrackMatches:
+    """Pieces most of whose dots are not on their group's path leave it.
+
+    A tracker's piece was cut wherever another view contradicts it, so its dots are of one animal; a few of them
+    off the path tell of a sudden turn.
+    """
+    n = len(matches.rival)
+    off, all_ = np.zeros(n + 1), np.zeros(n + 1)
+    for piece, wrong, group in zip(matches.pieces, paths.wrong, matches.groups, strict=True):
+        off += np.bincount(piece[(group >= 0) & wrong] + 1, minlength=n + 1)
+        all_ += np.bincount(piece[group >= 0] + 1, minlength=n + 1)
+    stranger = off > 0.5 * all_
+    groups, sure = [], []
+    for piece, group, confidence in zip(matches.pieces, matches.groups, matches.confidence, strict=True):
+        leaves = stranger[piece + 1]
+        groups.append(np.where(leaves, -1, group))
+        sure.append(np.where(leaves, np.nan, confidence))
+    return replace(matches, groups=tuple(groups), confidence=tuple(sure))
 
 
 def _with_claims(matches: TrackMatches, paths: Trajectories) -> TrackMatches:
     groups, sure = list(matches.groups), list(matches.confidence)
-    for k, view in enumerate(matches.recording.views):
+    for k in range(len(groups)):
         rows, group, probability = _claims(matches, paths, k)
-        better = probability >= 0.9
+        better = probability >= _SURE
         groups[k], sure[k] = groups[k].copy(), sure[k].copy()
         groups[k][rows[better]] = group[better]
         sure[k][rows[better]] = probability[better]
-        del view
     return replace(matches, groups=tuple(groups), confidence=tuple(sure))
 
 
@@ -92,23 +125,65 @@ def _claims(matches: TrackMatches, paths: Trajectories, k: int) -> tuple[np.ndar
     pixels, covariance = paths.predict_pixels(camera, paths.group[used], paths.frame[used])
     covariance = covariance + matches.noise.total**2 * np.eye(2)
     miss = view.xy[row] - pixels[inverse]
+    known = np.isfinite(pixels).all(1) & np.isfinite(covariance).all((1, 2))  # not behind the camera
+    covariance[~known] = np.eye(2)
     determinant = np.linalg.det(covariance)
     solved = np.linalg.solve(covariance[inverse], miss[..., None])[..., 0]
     squared = (miss * solved).sum(1)
-    near = squared < _GATE
+    near = (squared < _GATE) & known[inverse]
     row, at, squared, inverse = row[near], at[near], squared[near], inverse[near]
     area = float(np.prod(np.ptp(view.xy, axis=0) + 1.0))
     density = max(len(loose), 1) / max(len(np.unique(view.frame)), 1) / area
     odds = np.exp(-0.5 * squared) / (2 * np.pi * np.sqrt(determinant[inverse]) * density)
-    total = 1.0 + np.bincount(row, weights=odds, minlength=len(view))[row]
-    other = 1.0 + np.bincount(at, weights=odds, minlength=len(paths))[at]
-    probability = odds / (total + other - 1.0 - odds)
-    best = np.argsort(-probability, kind="stable")
-    _, first = np.unique(row[best], return_index=True)
-    best = best[np.sort(first)]
-    _, first = np.unique(at[best], return_index=True)
-    best = best[np.sort(first)]
-    return row[best], paths.group[at[best]], probability[best]
+    chosen, probability = _settle(row, at, np.log(odds))
+    return row[chosen], paths.group[at[chosen]], probability
+
+
+def _settle(row: np.ndarray, point: np.ndarray, odds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Claims (E) settled together: the chosen ones, and their probabilities.
+
+    The sum of the log-odds is made largest. The alternatives to a claim are none, another point or another row
+    for it, and an exchange with another claim.
+    """
+    rows, i = np.unique(row, return_inverse=True)
+    points, j = np.unique(point, return_inverse=True)
+    n = len(rows)
+    _, component = connected_components(
+        coo_array((np.ones(len(i)), (i, j + n)), shape=(n + len(points), n + len(points))), directed=False
+    )
+    part = component[i]
+    alone = np.bincount(part)[part] == 1
+    probability = np.zeros(len(i))
+    probability[alone] = 1.0 / (1.0 + np.exp(-odds[alone]))
+    order = np.argsort(part, kind="stable")
+    order = order[~alone[order]]
+    bounds = np.flatnonzero(np.r_[True, np.diff(part[order]) > 0, True]) if len(order) else np.zeros(1, int)
+    for low, high in zip(bounds[:-1], bounds[1:], strict=True):
+        e = order[low:high]
+        _, r = np.unique(i[e], return_inverse=True)
+        _, c = np.unique(j[e], return_inverse=True)
+        probability[e] = _settle_together(r, c, odds[e])
+    chosen = np.flatnonzero(probability > 0)
+    return chosen, probability[chosen]
+
+
+def _settle_together(r: np.ndarray, c: np.ndarray, odds: np.ndarray) -> np.ndarray:
+    """Probabilities of the claims of the best assignment, 0 for the others."""
+    table = np.full((r.max() + 1, c.max() + 1), -_NEVER)
+    table[r, c] = odds
+    rows, columns = linear_sum_assignment(np.maximum(table, 0.0), maximize=True)
+    kept = table[rows, columns] > 0
+    rows, columns = rows[kept], columns[kept]
+    free_rows, free_columns = np.ones(table.shape[0], dtype=bool), np.ones(table.shape[1], dtype=bool)
+    free_rows[rows], free_columns[columns] = False, False
+    out = np.zeros(len(r))
+    for a, b in zip(rows, columns, strict=True):
+        own = table[a, b]
+        others = np.concatenate([[0.0], table[a, free_columns], table[free_rows, b]])
+        exchange = table[a, columns] + np.maximum(table[rows, b], 0.0) - table[rows, columns]
+        against = np.concatenate([others, exchange[rows != a]]) - own
+        out[(r == a) & (c == b)] = 1.0 / (1.0 + np.exp(np.minimum(against, 500.0)).sum())
+    return out
 
 
 def _same_frame(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,4 +192,4 @@ def _same_frame(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low = np.searchsorted(b[order], a)
     count = np.searchsorted(b[order], a, side="right") - low
     i = np.repeat(np.arange(len(a)), count)
-    return i, order[np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)]
+    return i, order[runs(low, count)]

@@ -20,7 +20,8 @@ the dots of real detectors that are somewhere else.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from itertools import groupby
 
 import numpy as np
 
@@ -32,6 +33,9 @@ _CHUNK = 64
 _SELDOM = 0.25
 _STRAY = 0.02
 _BINS = 256
+_SPAN = 8.0 * np.pi  # from one frame to the next in keys of frame and angle
+_BATCH = 1_000_000
+_HOPELESS = -40.0  # pairs of pieces below count as never near each other
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,10 @@ class Evidence:
     chunks: np.ndarray
     weight: np.ndarray
 
+    def take(self, which: np.ndarray) -> Evidence:
+        """Some of the pairs."""
+        return Evidence(**{field.name: getattr(self, field.name)[which] for field in fields(self)})
+
 
 def near_dots(
     a: Dots, b: Dots, reach: float
@@ -109,7 +117,7 @@ def near_dots(
     Yields
     ------
     first, stop : int
-        The frames of the chunk.
+        The frames of the chunk. One with many dots comes in several parts.
     i, j : (K,) int
         Rows of a and of b.
     d : (K,)
@@ -125,7 +133,8 @@ def near_dots(
         rows_a = use_a[slice(*np.searchsorted(a.frame[use_a], (start, end)))]
         rows_b = use_b[slice(*np.searchsorted(b.frame[use_b], (start, end)))]
         if len(rows_a) and len(rows_b):
-            yield (start, end, *_near_in_chunk(a, b, rows_a, rows_b, reach))
+            for found in _near_in_chunk(a, b, rows_a, rows_b, reach):
+                yield (start, end, *found)
 
 
 def _usable(dots: Dots) -> np.ndarray:
@@ -134,36 +143,43 @@ def _usable(dots: Dots) -> np.ndarray:
 
 def _near_in_chunk(
     a: Dots, b: Dots, rows_a: np.ndarray, rows_b: np.ndarray, reach: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Sort the second view's dots by (frame, angle); look up the first view's, once a turn around the pencil."""
-    span = 8.0 * np.pi
     slope_a, slope_b = a.angles.slope[rows_a], b.angles.slope[rows_b]
     angle_a, angle_b = a.angles.angle[rows_a], b.angles.angle[rows_b]
-    key_b = b.frame[rows_b] * span + angle_b
+    key_b = b.frame[rows_b] * _SPAN + angle_b
     order = np.argsort(key_b)
-    sorted_b = key_b[order]
     half = np.minimum(reach * np.hypot(slope_a, slope_b.max()), np.pi)
-    found_a, found_b, found_d = [], [], []
     crossing = np.flatnonzero(np.abs(angle_a) + half > np.pi)
-    everyone = np.arange(len(rows_a))
-    for turn, who in ((0.0, everyone), (2 * np.pi, crossing), (-2 * np.pi, crossing)):
-        if not len(who):
-            continue
-        key_a = a.frame[rows_a[who]] * span + angle_a[who] + turn
-        low = np.searchsorted(sorted_b, key_a - half[who])
-        count = np.searchsorted(sorted_b, key_a + half[who], side="right") - low
-        i = np.repeat(who, count)
-        j = order[np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)]
-        d = (angle_a[i] + turn - angle_b[j]) / np.hypot(slope_a[i], slope_b[j])
-        meet = b.angles.along[rows_b[j]] - a.angles.along[rows_a[i]] > -reach * (slope_a[i] + slope_b[j])
-        keep = (np.abs(d) < reach) & meet
-        found_a.append(rows_a[i[keep]])
-        found_b.append(rows_b[j[keep]])
-        found_d.append(d[keep])
-    return np.concatenate(found_a), np.concatenate(found_b), np.concatenate(found_d)
+    for turn, who in ((0.0, np.arange(len(rows_a))), (2 * np.pi, crossing), (-2 * np.pi, crossing)):
+        key_a = a.frame[rows_a[who]] * _SPAN + angle_a[who] + turn
+        low = np.searchsorted(key_b[order], key_a - half[who])
+        count = np.searchsorted(key_b[order], key_a + half[who], side="right") - low
+        for part in _batches(count):
+            i = np.repeat(who[part], count[part])
+            j = order[runs(low[part], count[part])]
+            d = (angle_a[i] + turn - angle_b[j]) / np.hypot(slope_a[i], slope_b[j])
+            meet = b.angles.along[rows_b[j]] - a.angles.along[rows_a[i]] > -reach * (slope_a[i] + slope_b[j])
+            keep = (np.abs(d) < reach) & meet
+            yield rows_a[i[keep]], rows_b[j[keep]], d[keep]
 
 
-def gather_evidence(a: Dots, b: Dots, noise: Noise) -> Evidence:
+def runs(low: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """The numbers low, low + 1 … (count of them) of every entry, one after the other."""
+    return np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)
+
+
+def _batches(count: np.ndarray) -> Iterator[slice]:
+    """Slices of the entries with about a million pairs each."""
+    if not len(count):
+        return
+    batch = np.cumsum(count) // _BATCH
+    edges = np.flatnonzero(np.r_[True, batch[1:] != batch[:-1], True])
+    for first, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        yield slice(first, stop)
+
+
+def gather_evidence(a: Dots, b: Dots, noise: Noise, prune: bool = True) -> Evidence:
     """Weights of all pairs of pieces that are near each other in at least one frame in four.
 
     Parameters
@@ -172,8 +188,11 @@ def gather_evidence(a: Dots, b: Dots, noise: Noise) -> Evidence:
         Of the two views of a pair, with the plane angles of this pair.
     noise : Noise
         Of a dot's coordinate.
+    prune : bool
+        Whether to leave out hopeless pairs.
     """
-    parts = [_chunk_evidence(a, b, chunk, noise) for chunk in near_dots(a, b, REACH * noise.total)]
+    chunks_of = groupby(near_dots(a, b, REACH * noise.total), key=lambda found: found[:2])
+    parts = [_chunk_evidence(a, b, chunk, [f[2:] for f in found], noise) for chunk, found in chunks_of]
     key = np.concatenate([part[0] for part in parts]) if parts else np.empty(0, dtype=np.int64)
     order = np.argsort(key, kind="stable")
     key = key[order]
@@ -190,23 +209,32 @@ def gather_evidence(a: Dots, b: Dots, noise: Noise) -> Evidence:
     found = Evidence(
         piece_a, piece_b, near, shared, squares, sums, between, means, chunks, np.zeros(len(pairs))
     )
-    return replace(found, weight=_weights(a, b, noise, found))
+    found = replace(found, weight=_weights(a, b, noise, found))
+    return found.take(found.weight > _HOPELESS) if prune else found
 
 
-def _chunk_evidence(a: Dots, b: Dots, chunk, noise: Noise) -> tuple[np.ndarray, ...]:
+def _chunk_evidence(
+    a: Dots,
+    b: Dots,
+    chunk: tuple[int, int],
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    noise: Noise,
+) -> tuple[np.ndarray, ...]:
     """Keys and sums of one chunk, as in :class:`Evidence`; pairs that are seldom near are left out."""
-    start, end, i, j, d = chunk
+    start, end = chunk
     active_a, local_a = _active(a, start, end)
     active_b, local_b = _active(b, start, end)
     n_a, n_b = len(active_a), len(active_b)
-    index = local_a[a.piece[i]] * n_b + local_b[b.piece[j]]
-    near = np.bincount(index, minlength=n_a * n_b)
+    near, squares, sums = np.zeros(n_a * n_b), np.zeros(n_a * n_b), np.zeros(n_a * n_b)
+    for i, j, d in found:
+        index = local_a[a.piece[i]] * n_b + local_b[b.piece[j]]
+        near += np.bincount(index, minlength=n_a * n_b)
+        squares += np.bincount(index, weights=d**2, minlength=n_a * n_b)
+        sums += np.bincount(index, weights=d, minlength=n_a * n_b)
     shared = _presence(a, start, end, local_a, n_a) @ _presence(b, start, end, local_b, n_b).T
     keep = np.flatnonzero((near > 0) & (near >= _SELDOM * shared.ravel()))
-    squares = np.bincount(index, weights=d**2, minlength=n_a * n_b)[keep]
-    sums = np.bincount(index, weights=d, minlength=n_a * n_b)[keep]
     key = active_a[keep // n_b].astype(np.int64) * b.n_pieces + active_b[keep % n_b]
-    count = near[keep].astype(float)
+    count, squares, sums = near[keep], squares[keep], sums[keep]
     means = sums**2 / count
     between = means / (noise.white**2 + count * noise.slow**2)
     return key, count, squares, sums, between, means, np.ones(len(keep))

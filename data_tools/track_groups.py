@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from acino_fte.data_tools.track_evidence import runs
+
 ABSENT = -4.0
 """Log-odds a frame of two pieces that overlap in time and were seldom near each other."""
 _MARGINS = (40.0, 20.0, 10.0, 6.0, 4.0, 2.0, 1.0)
@@ -209,7 +211,7 @@ def _rivals(who: np.ndarray, other: np.ndarray, total: np.ndarray, occupied: np.
     low = np.searchsorted(who[order], who)
     count = np.searchsorted(who[order], who, side="right") - low
     mine = np.repeat(np.arange(len(who)), count)
-    rival = order[np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)]
+    rival = order[runs(low, count)]
     apart = mine != rival
     mine, rival = mine[apart], rival[apart]
     clash = np.zeros(len(mine), dtype=bool)

@@ -10,8 +10,11 @@ another reason, and then against all other continuations of either piece: only a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+
+from acino_fte.data_tools.track_evidence import runs
 
 MAX_GAP_S = 1.0
 _DEFAULT_GAP = 30
@@ -19,6 +22,8 @@ _FIT = 4
 _LONGEST, _AGREE = 32, 3.0
 _TAIL = 4.0  # degrees of freedom of the t distribution
 _LEAST = 30
+_FAR, _BATCH = 12.0, 1_000_000
+_CALM, _CROWD = 0.2, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +77,14 @@ def link_pieces(pieces: ViewPieces, noise: float, max_gap: int) -> tuple[np.ndar
     weight : (E,)
         Log-odds against every other continuation of either; only positive ones.
     """
-    earlier, later = _candidates(pieces, max_gap)
-    if not len(earlier):
-        return earlier, later, np.empty(0)
     model = _learn(pieces, noise, max_gap)
     tail = _ends(pieces, noise, forwards=True)
     head = _ends(pieces, noise, forwards=False)
+    earlier, later = _candidates(pieces, _useful_gap(pieces, tail, model, max_gap))
+    near = _within_reach(tail, head, earlier, later, pieces, model)
+    earlier, later = earlier[near], later[near]
+    if not len(earlier):
+        return earlier, later, np.empty(0)
     gap = pieces.first[later] - pieces.last[earlier]
     moving = 0.5 * (
         _log_density(tail, earlier, head.place[later], gap, model)
@@ -103,6 +110,11 @@ class _Ends:
     velocity: np.ndarray
     scale: np.ndarray
     still: np.ndarray
+
+    @cached_property
+    def speed(self) -> np.ndarray:
+        """(K,) px/frame."""
+        return np.linalg.norm(self.velocity, axis=1)
 
 
 def _ends(pieces: ViewPieces, noise: float, forwards: bool) -> _Ends:
@@ -263,8 +275,38 @@ def _candidates(pieces: ViewPieces, max_gap: int) -> tuple[np.ndarray, np.ndarra
     low = np.searchsorted(first, pieces.last, side="right")
     count = np.searchsorted(first, pieces.last + max_gap, side="right") - low
     earlier = np.repeat(np.arange(pieces.n), count)
-    later = order[np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)]
+    later = order[runs(low, count)]
     return earlier, later
+
+
+def _useful_gap(pieces: ViewPieces, tail: _Ends, model: _Model, max_gap: int) -> int:
+    """The longest gap before which fewer than a few other pieces begin where even a calm animal may have got to."""
+    calm = np.quantile(tail.scale, _CALM) * np.minimum(model.line, model.none)
+    spread = np.minimum(calm, np.maximum(model.rest, calm / _LONGEST)) if tail.still.mean() > _CALM else calm
+    size = np.ptp(pieces.xy, axis=0) + 1.0
+    begin = pieces.n / (size[0] * size[1] * (np.ptp(pieces.frame) + 1.0))
+    crowded = begin * model.gap * 2 * np.pi * spread**2 > _CROWD
+    return int(min(model.gap[np.argmax(crowded)], max_gap)) if crowded.any() else max_gap
+
+
+def _within_reach(
+    tail: _Ends, head: _Ends, earlier: np.ndarray, later: np.ndarray, pieces: ViewPieces, model: _Model
+) -> np.ndarray:
+    """Candidates that the motion could join at all; spares most of the work when there are many animals."""
+    near = np.empty(len(earlier), dtype=bool)
+    for start in range(0, len(earlier), _BATCH):
+        part = slice(start, start + _BATCH)
+        e, k = earlier[part], later[part]
+        gap = pieces.first[k] - pieces.last[e]
+        beyond = np.maximum(gap / model.gap[-1], 1.0)
+        miss = (
+            np.minimum(np.interp(gap, model.gap, model.line), np.interp(gap, model.gap, model.none)) * beyond
+        )
+        rest = np.interp(gap, model.gap, np.minimum(model.rest, 1e6)) * np.sqrt(beyond)
+        carried = gap * np.maximum(tail.speed[e], head.speed[k])
+        limit = carried + _FAR * (miss * np.maximum(tail.scale[e], head.scale[k]) + rest)
+        near[part] = ((head.place[k] - tail.place[e]) ** 2).sum(1) < limit**2
+    return near
 
 
 def _rivals(who: np.ndarray, other: np.ndarray, odds: np.ndarray, pieces: ViewPieces) -> np.ndarray:
@@ -276,7 +318,7 @@ def _rivals(who: np.ndarray, other: np.ndarray, odds: np.ndarray, pieces: ViewPi
     low = np.searchsorted(who[order], who)
     count = np.searchsorted(who[order], who, side="right") - low
     mine = np.repeat(np.arange(len(who)), count)
-    rival = order[np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)]
+    rival = order[runs(low, count)]
     first, last = pieces.first[other], pieces.last[other]
     clash = (first[mine] <= last[rival]) & (first[rival] <= last[mine]) & (mine != rival)
     mine, rival = mine[clash], rival[clash]

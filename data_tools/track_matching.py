@@ -45,10 +45,10 @@ if TYPE_CHECKING:
     from acino_fte.data_tools.trajectories3d import Trajectories
 
 _STITCH = 4.0
-_NOISE_CHANGED = 0.1
+_NOISE_CHANGED = 0.04
 _FPS = 30.0
-_MOST_CUTS = 3
-_LONG, _FAR_SHARE, _FAR_FRAMES = 10, 0.05, 2.0
+_MOST_CUTS = 4
+_LONG, _FAR_SHARE, _FAR_FRAMES = 10, 0.05, 1.0
 
 Progress = Callable[[str], None]
 
@@ -242,8 +242,8 @@ class _Matching:
         u = np.concatenate([e.a + offsets[a] for (a, _), e in self.evidence.items()])
         v = np.concatenate([e.b + offsets[b] for (_, b), e in self.evidence.items()])
         weight = np.concatenate([e.weight for e in self.evidence.values()])
-        prior = partner_log_odds(n_dots, u, v, weight)
-        edges = [(u, v, weight + np.minimum(prior[u], prior[v]))]
+        prior = partner_log_odds(n_dots, u, v, weight, len(pieces))
+        edges = [(u, v, weight + prior[u] + prior[v])]
         for k, p in enumerate(pieces):
             if p.n:
                 earlier, later, odds = link_pieces(p, self.noise.total, self.max_gap)
@@ -312,8 +312,8 @@ class _Matching:
             inverse = np.empty(len(piece), dtype=np.int64)
             inverse[view.order] = np.arange(len(piece))
             pieces.append(piece[inverse])
-            found.append(np.where(pieces[k] >= 0, group[pieces[k]], -1))
-            sure.append(np.where(found[k] >= 0, confidence.probability[pieces[k]], np.nan))
+            found.append(_of_piece(group, pieces[k], -1))
+            sure.append(np.where(found[k] >= 0, _of_piece(confidence.probability, pieces[k], np.nan), np.nan))
         of_label = np.full(len(self.label), -1)
         of_label[self.label[group >= 0]] = group[group >= 0]
         rival = np.where(confidence.rival >= 0, of_label[confidence.rival], -1)
@@ -330,6 +330,11 @@ class _Matching:
             tell("3D paths")
             matches = claim_loose_dots(matches, self.max_gap)
         return matches
+
+
+def _of_piece(values: np.ndarray, piece: np.ndarray, otherwise: float) -> np.ndarray:
+    """The value of every dot's piece, or another for dots in no piece."""
+    return np.append(values, np.asarray(otherwise, dtype=values.dtype))[piece]  # piece −1 is the last
 
 
 def _number_groups(graph: PieceGraph, label: np.ndarray, confidence: Confidence, least: float) -> np.ndarray:

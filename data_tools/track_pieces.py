@@ -48,6 +48,13 @@ class PiecedView:
         return ViewPieces(self.frame[rows], self.xy[rows], start)
 
 
+def belongs(piece: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Whether each dot's piece (P,) is one of the chosen (K,) bool; False for dots in no piece."""
+    if not len(chosen):
+        return np.zeros(len(piece), dtype=bool)
+    return (piece >= 0) & chosen[piece]
+
+
 def pieced(frame: np.ndarray, track: np.ndarray, xy: np.ndarray) -> PiecedView:
     """Whole tracks as pieces; a bare point is in no piece."""
     order = np.argsort(frame, kind="stable")
@@ -70,8 +77,7 @@ def cut_at_encounters(view: PiecedView, doubtful: np.ndarray, radius: float) -> 
     radius : float
         What is near, px.
     """
-    doubted = (view.piece >= 0) & doubtful[view.piece]
-    rows = np.flatnonzero(doubted)
+    rows = np.flatnonzero(belongs(view.piece, doubtful))
     if not len(rows):
         return view
     rows = rows[np.argsort(view.piece[rows], kind="stable")]
@@ -90,6 +96,8 @@ def cut_at(view: PiecedView, piece: np.ndarray, frame: np.ndarray) -> PiecedView
         What to cut and where; a piece may appear more than once.
     """
     rows = np.flatnonzero(np.isin(view.piece, piece))
+    if not len(rows):
+        return view
     rows = rows[np.argsort(view.piece[rows], kind="stable")]
     span = int(view.frame.max()) + 1
     key = view.piece[rows].astype(np.int64) * span + view.frame[rows]

@@ -6,7 +6,7 @@ the log of the mean Bayes factor of a piece over the pieces it might belong to,
 
     P(partner) = π e^S / (1 − π + π e^S),     π ← mean of P(partner)
 
-(Dempster, Laird and Rubin 1977). A pair of pieces pays the prior log-odds of its less likely end.
+(Dempster, Laird and Rubin 1977). A pair of pieces pays the prior log-odds of both its ends.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ _STEPS = 30
 _PSEUDO = 1.0  # one piece with a partner and one without, in every class of lengths
 
 
-def partner_log_odds(n_dots: np.ndarray, u: np.ndarray, v: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def partner_log_odds(
+    n_dots: np.ndarray, u: np.ndarray, v: np.ndarray, weight: np.ndarray, n_views: int = 2
+) -> np.ndarray:
     """Prior log-odds of having a partner, by length, never more than 0.
 
     Parameters
@@ -27,7 +29,9 @@ def partner_log_odds(n_dots: np.ndarray, u: np.ndarray, v: np.ndarray, weight: n
     u, v : (E,) int
         Pairs of pieces of different views.
     weight : (E,)
-        Their log Bayes factors, less the log of the number of candidates.
+        Their log Bayes factors, less the log of the number of candidates in one view.
+    n_views : int
+        C; a piece has candidates in C − 1 views.
 
     Returns
     -------
@@ -35,7 +39,7 @@ def partner_log_odds(n_dots: np.ndarray, u: np.ndarray, v: np.ndarray, weight: n
     """
     n = len(n_dots)
     level = np.floor(np.log2(np.maximum(n_dots, 1))).astype(int)
-    score = np.logaddexp(_log_sum(u, weight, n), _log_sum(v, weight, n))
+    score = np.logaddexp(_log_sum(u, weight, n), _log_sum(v, weight, n)) - np.log(n_views - 1)
     total = np.bincount(level)
     share = np.full(len(total), 0.5)
     with np.errstate(over="ignore"):
