@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acino_fte.data_tools.match_rows import compact
-from acino_fte.data_tools.track_evidence import Noise
+from acino_fte.data_tools.track_dots import Noise
 from acino_fte.data_tools.track_matching import TrackMatches
 from acino_fte.data_tools.tracks2d import TrackRecording
 

@@ -221,8 +221,8 @@ def epipolar_residuals(matches: TrackMatches) -> Iterator[tuple[int, int, np.nda
         place = np.arange(len(frame)) - start
         other = start + (place + 1 + place % np.maximum(count - 1, 1)) % count
         several = (count > 1) & (other != np.arange(len(frame)))
-        distance = _sampson(matches, (a, b), row_a, row_b)
-        yield a, b, distance, _sampson(matches, (a, b), row_a[several], row_b[other[several]])
+        distance = sampson_of_rows(matches, (a, b), row_a, row_b)
+        yield a, b, distance, sampson_of_rows(matches, (a, b), row_a[several], row_b[other[several]])
 
 
 def _some_frames(frame: np.ndarray) -> np.ndarray:
@@ -235,17 +235,19 @@ def _some_frames(frame: np.ndarray) -> np.ndarray:
     return order[number % every == 0]
 
 
-def _sampson(
+def sampson_of_rows(
     matches: TrackMatches, views: tuple[int, int], row_a: np.ndarray, row_b: np.ndarray
 ) -> np.ndarray:
+    """Signed Sampson distances (K,) of rows of two views, each two of one frame, px."""
     recording = matches.recording
     pose = recording.views[views[0]].frame[row_a] - recording.first_frame
     pixels, jacobians, poses, inverses = [], [], [], []
     for k, rows in zip(views, (row_a, row_b), strict=True):
-        camera, xy = recording.cameras[k], recording.views[k].xy[rows]
-        still = _still(camera)
-        pixels.append(ideal_pixels(still, xy))
-        jacobians.append(ideal_jacobian(still, xy))
+        camera = recording.cameras[k]
+        used, place = np.unique(rows, return_inverse=True)
+        still, xy = _still(camera), recording.views[k].xy[used]
+        pixels.append(ideal_pixels(still, xy)[place])
+        jacobians.append(ideal_jacobian(still, xy)[place])
         posed = at_rows(camera, pose)
         poses += [posed.rotation, posed.translation]
         inverses.append(np.linalg.inv(camera.matrix))

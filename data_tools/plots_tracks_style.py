@@ -1,0 +1,66 @@
+"""What the figures of a matching share: the title, and a colour for each animal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from acino_fte.plots_style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
+
+if TYPE_CHECKING:
+    from acino_fte.data_tools.track_matching import TrackMatches
+
+DISTINCT = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, "#000000")
+NAMED = 25
+"""With more animals than this, their numbers are not written."""
+_DARKEST, _PALEST = 0.0, 0.9
+_GOLDEN = 0.6180339887498949
+
+
+def colours_of(n: int) -> np.ndarray:
+    """A colour (n, 3) for each of n animals or cameras.
+
+    Up to seven are those of Okabe and Ito (2008), up to 21 also their dark and their pale tones. More lie
+    along an even, colour-blind safe scale, those of successive numbers far apart (the golden section).
+    """
+    pure = np.array([to_rgb(c) for c in DISTINCT])
+    tones = np.concatenate(
+        [pure, np.where(pure.any(1, keepdims=True), 0.55 * pure, 0.35), 0.45 * pure + 0.55]
+    )
+    if n <= len(tones):
+        return tones[:n]
+    place = np.arange(n) * _GOLDEN % 1.0
+    rank = np.argsort(np.argsort(place)) / (n - 1)
+    return colormaps["viridis"](_DARKEST + (_PALEST - _DARKEST) * rank)[:, :3]
+
+
+def new_track_figure(
+    matches: TrackMatches, title: str, width: float, height: float, top: float = 0.7
+) -> Figure:
+    """Start a figure of a size in inches, with a title; `top` is the height kept for it, in."""
+    recording = matches.recording
+    figure = Figure(figsize=(width, height))
+    figure.subplots_adjust(top=1.0 - top / height)
+    last = recording.first_frame + max(recording.n_frames - 1, 0)
+    where = (
+        f"{recording.name} · {matches.n_groups} animals · {len(recording.views)} cameras · "
+        f"frames {recording.first_frame}–{last}"
+        + ("" if recording.fps is None else f" · {recording.fps:g} frames/s")
+    )
+    figure.text(0.1 / width, 1 - 0.09 / height, title, va="top", fontsize=13)
+    figure.text(0.1 / width, 1 - 0.33 / height, where, va="top", fontsize=8.5, color=GREY)
+    return figure
+
+
+def runs(breaks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First and stop of the runs of n entries, where `breaks` (n,) says that an entry begins a new one."""
+    if not len(breaks):
+        return np.empty(0, dtype=int), np.empty(0, dtype=int)
+    breaks = breaks.copy()
+    breaks[0] = True
+    start = np.flatnonzero(breaks)
+    return start, np.append(start[1:], len(breaks))
