@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from acino_fte.data_tools.track_evidence import runs
+from acino_fte.data_tools.track_dots import runs
 from acino_fte.data_tools.track_groups import PieceGraph
 
 _MOST = 700.0

@@ -14,7 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from acino_fte.data_tools.track_evidence import REACH, Dots, Evidence, Noise, gather_evidence
+from acino_fte.data_tools.track_dots import Dots, Noise
+from acino_fte.data_tools.track_evidence import REACH, Evidence, gather_evidence
 
 _REACHES = (0.01, 0.02, 0.04, 0.08, 0.16)  # of the diagonal
 _FEWEST, _ALWAYS = (8, 4, 2, 1), 0.9  # frames that windows must share; fewer for very short recordings

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from acino_fte.data_tools.track_evidence import REACH, Dots, Noise, log_chance, memories, near_dots
+from acino_fte.data_tools.track_dots import Dots, Noise
+from acino_fte.data_tools.track_evidence import REACH, log_chance, near_dots
+from acino_fte.data_tools.track_memory import memories
 from acino_fte.data_tools.track_pieces import belongs
 
 CHANGE = 12.0

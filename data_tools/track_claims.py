@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from acino_fte.data_tools.track_evidence import runs
+from acino_fte.data_tools.track_dots import runs
 from acino_fte.data_tools.track_joins import join_paths
 from acino_fte.data_tools.trajectories3d import SOURCES, Trajectories, smooth_trajectories
 from acino_fte.data_tools.trajectory_rows import ViewRows

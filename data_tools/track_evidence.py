@@ -25,7 +25,8 @@ from itertools import groupby
 
 import numpy as np
 
-from acino_fte.data_tools.epipolar_angles import PlaneAngles
+from acino_fte.data_tools.track_dots import Dots, Noise, runs, usable_rows
+from acino_fte.data_tools.track_memory import memories
 
 REACH = 4.0
 """Dots further apart than this, in standard deviations, are as good as unrelated; the floor of a frame."""
@@ -36,39 +37,6 @@ _BINS = 256
 _SPAN = 8.0 * np.pi  # from one frame to the next in keys of frame and angle
 _BATCH = 1_000_000
 _HOPELESS = -40.0  # pairs of pieces below count as never near each other
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations of d, px: from frame to frame, and of its slow part."""
-
-    white: float
-    slow: float = 0.0
-
-    @property
-    def total(self) -> float:
-        """Both together."""
-        return float(np.hypot(self.white, self.slow))
-
-
-@dataclass(frozen=True, eq=False)
-class Dots:
-    """The dots of one view of a pair, sorted by frame.
-
-    Attributes
-    ----------
-    frame : (P,) int
-        From 0.
-    piece : (P,) int
-        Piece of track, from 0 to n_pieces − 1; −1 for a dot that takes no part.
-    n_pieces : int
-    angles : PlaneAngles
-    """
-
-    frame: np.ndarray
-    piece: np.ndarray
-    n_pieces: int
-    angles: PlaneAngles
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +91,7 @@ def near_dots(
     d : (K,)
         Signed distance, px.
     """
-    use_a, use_b = _usable(a), _usable(b)
+    use_a, use_b = usable_rows(a), usable_rows(b)
     if not len(use_a) or not len(use_b):
         return
     first = int(min(a.frame[use_a[0]], b.frame[use_b[0]]))
@@ -135,10 +103,6 @@ def near_dots(
         if len(rows_a) and len(rows_b):
             for found in _near_in_chunk(a, b, rows_a, rows_b, reach):
                 yield (start, end, *found)
-
-
-def _usable(dots: Dots) -> np.ndarray:
-    return np.flatnonzero(np.isfinite(dots.angles.angle) & (dots.piece >= 0))
 
 
 def _near_in_chunk(
@@ -162,11 +126,6 @@ def _near_in_chunk(
             meet = b.angles.along[rows_b[j]] - a.angles.along[rows_a[i]] > -reach * (slope_a[i] + slope_b[j])
             keep = (np.abs(d) < reach) & meet
             yield rows_a[i[keep]], rows_b[j[keep]], d[keep]
-
-
-def runs(low: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """The numbers low, low + 1 … (count of them) of every entry, one after the other."""
-    return np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)
 
 
 def _batches(count: np.ndarray) -> Iterator[slice]:
@@ -276,7 +235,7 @@ def shared_frames(a: Dots, b: Dots, piece_a: np.ndarray, piece_b: np.ndarray) ->
 
 
 def _bits(dots: Dots, n_frames: int) -> np.ndarray:
-    rows = _usable(dots)
+    rows = usable_rows(dots)
     present = np.zeros((dots.n_pieces, n_frames), dtype=bool)
     present[dots.piece[rows], dots.frame[rows]] = True
     return np.packbits(present, axis=1)
@@ -304,7 +263,7 @@ def _weights(a: Dots, b: Dots, noise: Noise, e: Evidence) -> np.ndarray:
 
 def animals_in_view(dots: Dots) -> float:
     """Mean number of dots in the frames that have any."""
-    rows = _usable(dots)
+    rows = usable_rows(dots)
     return max(len(rows) / max(len(np.unique(dots.frame[rows])), 1), 1.0)
 
 
@@ -313,7 +272,7 @@ def log_chance(a: Dots, b: Dots, noise: float) -> np.ndarray:
 
     The density is that of the dots of b over the angle, from all frames.
     """
-    rows_a, rows_b = _usable(a), _usable(b)
+    rows_a, rows_b = usable_rows(a), usable_rows(b)
     chance = np.zeros(a.n_pieces)
     if not len(rows_a) or not len(rows_b):
         return chance
@@ -329,33 +288,3 @@ def log_chance(a: Dots, b: Dots, noise: float) -> np.ndarray:
     piece = a.piece[rows_a]
     count = np.bincount(piece, minlength=a.n_pieces)
     return np.bincount(piece, weights=value, minlength=a.n_pieces) / np.maximum(count, 1)
-
-
-def memories(dots: Dots, noise: float) -> np.ndarray:
-    """L of each piece, (pieces,) frames: the lag after which it has left its plane by two standard deviations.
-
-    From the mean squared change of θ over lags 1, 2, 4 …, in px, less the noise's own 2σ².
-    """
-    rows = _usable(dots)
-    rows = rows[np.lexsort((dots.frame[rows], dots.piece[rows]))]
-    piece, frame = dots.piece[rows], dots.frame[rows]
-    angle, slope = dots.angles.angle[rows], dots.angles.slope[rows]
-    length = np.bincount(piece, minlength=dots.n_pieces).astype(float)
-    memory = np.maximum(length, 1.0)
-    open_ = np.ones(dots.n_pieces, dtype=bool)
-    lag = 1
-    previous = np.zeros(dots.n_pieces)
-    while lag < len(rows) and open_.any():
-        same = (piece[lag:] == piece[:-lag]) & (frame[lag:] - frame[:-lag] <= 2 * lag)
-        owner = piece[lag:][same]
-        change = (angle[lag:][same] - angle[:-lag][same]) / slope[lag:][same]
-        count = np.bincount(owner, minlength=dots.n_pieces)
-        mean = np.bincount(owner, weights=change**2, minlength=dots.n_pieces) / np.maximum(count, 1)
-        moved = np.sqrt(np.maximum(mean - 2 * noise**2, 0.0)) / (2 * noise)
-        left = open_ & (count > 0) & (moved >= 1.0)
-        share = (1.0 - previous[left]) / np.maximum(moved[left] - previous[left], 1e-9)
-        memory[left] = np.maximum(lag / 2 + share * lag / 2, 1.0) if lag > 1 else 1.0
-        open_ &= ~left & (count > 0)
-        previous = moved
-        lag *= 2
-    return np.minimum(memory, np.maximum(length, 1.0))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from acino_fte.data_tools.track_evidence import runs
+from acino_fte.data_tools.track_dots import runs
 
 ABSENT = -4.0
 """Log-odds a frame of two pieces that overlap in time and were seldom near each other."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acino_fte.data_tools.track_evidence import runs
+from acino_fte.data_tools.track_dots import runs
 
 if TYPE_CHECKING:
     from acino_fte.data_tools.track_matching import TrackMatches

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from acino_fte.data_tools.track_evidence import runs
+from acino_fte.data_tools.track_dots import runs
 
 MAX_GAP_S = 1.0
 _DEFAULT_GAP = 30

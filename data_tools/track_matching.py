@@ -32,7 +32,8 @@ from acino_fte.data_tools.match_confidence import Confidence, confidence_of
 from acino_fte.data_tools.match_noise import first_noise, matched_noise
 from acino_fte.data_tools.track_changes import find_changes
 from acino_fte.data_tools.track_claims import claim_loose_dots
-from acino_fte.data_tools.track_evidence import Dots, Evidence, Noise, gather_evidence
+from acino_fte.data_tools.track_dots import Dots, Noise
+from acino_fte.data_tools.track_evidence import Evidence, gather_evidence
 from acino_fte.data_tools.track_groups import PieceGraph, group_pieces
 from acino_fte.data_tools.track_links import link_pieces
 from acino_fte.data_tools.track_pieces import PiecedView, cut_at, cut_at_encounters, pieced

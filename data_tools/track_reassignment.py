@@ -45,18 +45,19 @@ def _reassign_view(graph: PieceGraph, label: np.ndarray, view: int) -> np.ndarra
     now = np.zeros(n)
     own = rest == part
     now[part[own]] = gain[own]
+    target, fresh, improvement = np.arange(n), n, 0.0
+    misplaced = np.flatnonzero(now < 0)
+    target[misplaced] = fresh + np.arange(len(misplaced))
+    fresh += len(misplaced)
+    improvement -= now[misplaced].sum()
+    now[misplaced] = 0.0
     useful = gain > 0
     rest, part, gain = rest[useful], part[useful], gain[useful]
-    if not len(gain):
-        return None
-    target = np.arange(n)
-    improvement = 0.0
     _, component = connected_components(
         coo_array((gain, (rest, part + n)), shape=(2 * n, 2 * n)), directed=False
     )
     order = np.argsort(component[rest], kind="stable")
     bounds = np.flatnonzero(np.r_[True, np.diff(component[rest][order]) > 0, True])
-    fresh = n
     for low, high in zip(bounds[:-1], bounds[1:], strict=True):
         e = order[low:high]
         rests, i = np.unique(rest[e], return_inverse=True)
