@@ -109,7 +109,7 @@ def viewer_data(matches: TrackMatches, points: SpacePoints) -> dict[str, Any]:
         "fps": recording.fps,
         "grid": ground_grid(inside[:, None]),
         "middle": np.round(0.5 * (low + high), 4).tolist(),
-        "size": float(max(np.linalg.norm(high - low), 1e-3)),
+        "size": max(float(np.linalg.norm(high - low)), 1e-3),
     }
 
 

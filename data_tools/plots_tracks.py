@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from acino_fte.data_tools.track_matching import TrackMatches
 
 DPI = 150
+LATIN = {"axes.unicode_minus": False}
+"""Glyphs beyond Latin 1 are a second font in a PDF, and twice the time; so there are none here."""
 
 FIGURES: dict[str, tuple[str, Callable[[TrackMatches, SpacePoints], Figure]]] = {
     "tracks_3d": ("3D tracks, a colour for each animal", space_figure),
@@ -52,7 +54,7 @@ def save_track_figures(matches: TrackMatches, points: SpacePoints, folder: Path 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     written = []
-    style: Any = {**dict(matplotlib.rcParamsDefault), **STYLE}  # whatever the user's own settings are
+    style: Any = {**dict(matplotlib.rcParamsDefault), **STYLE, **LATIN}  # whatever the user's settings are
     with matplotlib.rc_context(style):
         for name, (_, draw) in FIGURES.items():
             figure = draw(matches, points)

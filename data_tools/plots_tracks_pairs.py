@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 
 from acino_fte.data_tools.match_points import SpacePoints, epipolar_residuals, matched_pairs, sampson_of_rows
-from acino_fte.data_tools.plots_tracks_style import new_track_figure
+from acino_fte.data_tools.plots_tracks_style import legend, new_track_figure
 from acino_fte.plots_style import BLUE, GREY, ORANGE, RED, blank, margins
 
 if TYPE_CHECKING:
@@ -38,10 +38,12 @@ def residual_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
     if not found:
         return blank(new_track_figure(matches, title, 7.0, 2.4), "no animal was matched")
     names = matches.recording.cameras.names
-    panels = [(f"{names[a]} – {names[b]}", matched, chance) for a, b, matched, chance in found]
+    panels: list[tuple[str, Any, Any]] = [
+        (f"{names[a]}, {names[b]}", matched, chance) for a, b, matched, chance in found
+    ]
     if len(panels) > _PANELS:
-        joined = [np.concatenate([panel[k] for panel in panels]) for k in (1, 2)]
-        panels = [(f"all {len(panels)} pairs of cameras", *joined)]
+        matched, chance = (np.concatenate([panel[k] for panel in panels]) for k in (1, 2))
+        panels = [(f"all {len(panels)} pairs of cameras", matched, chance)]
     columns = min(3, len(panels))
     rows = math.ceil(len(panels) / columns)
     width, height = (7.0 if columns == 1 else 1.0 + 3.3 * columns), 1.35 + 2.45 * rows
@@ -57,12 +59,12 @@ def residual_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
             axes.set_xlabel("signed Sampson distance (px)")
     for axes in grid[len(panels) :]:
         axes.set_visible(False)
-    for x, (text, colour) in zip(
-        (0.75, 1.95, 4.6),
-        (("■ matched dots", BLUE), ("— Gaussian of the estimated noise", "black"), ("— by chance", ORANGE)),
-        strict=True,
-    ):
-        figure.text(x / width, 1 - 0.6 / height, text, color=colour, fontsize=8.5)
+    marks: list[tuple[str, dict[str, Any]]] = [
+        ("matched dots", {"lw": 6, "alpha": 0.55, "color": BLUE}),
+        ("Gaussian of the estimated noise", {"color": "black"}),
+        ("by chance", {"color": ORANGE}),
+    ]
+    legend(figure, marks, 0.1, 0.56)
     return figure
 
 
@@ -74,7 +76,7 @@ def _residual_panel(axes: Axes, matched: np.ndarray, chance: np.ndarray, noise: 
     bins = np.linspace(-reach, reach, int(np.clip(2 * math.sqrt(len(matched)), 21, 81)))
     width = bins[1] - bins[0]
     weights = np.full(len(matched), 1 / (max(len(matched), 1) * width))
-    axes.hist(matched, bins, weights=weights, color=BLUE, alpha=0.55, lw=0, histtype="stepfilled")
+    axes.hist(matched, bins.tolist(), weights=weights, color=BLUE, alpha=0.55, lw=0, histtype="stepfilled")
     if len(chance):
         counts, _ = np.histogram(chance, bins)
         axes.stairs(counts / (len(chance) * width), bins, color=ORANGE, lw=1.1)
@@ -121,7 +123,7 @@ def matrix_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
         0.1 / 7.2,
         1 - 0.53 / 7.0,
         "white: seldom near, or never together"
-        + ("" if whole else " · red frame: one animal · sorted by animal, unmatched last"),
+        + ("" if whole else "; red frame: one animal; sorted by animal, unmatched last"),
         va="top",
         fontsize=8.5,
         color=GREY,
@@ -141,7 +143,7 @@ def matrix_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
         _ticks(axis, unit[:, 1])
     bar = figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02)
     bar.set_label(f"share of common frames within {_WITHIN:g} standard deviations")
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     return figure
 
 
@@ -221,7 +223,7 @@ def _ticks(axis, group: np.ndarray) -> None:
     """Numbers of the animals at the middle of their pieces, when there is room."""
     known = np.unique(group[group >= 0])
     places = np.array([np.flatnonzero(group == g).mean() for g in known])
-    room, taken, kept = len(group) / 28, -np.inf, []
+    room, taken, kept = len(group) / 22, -np.inf, []
     for g, place in zip(known, places, strict=True):
         if place - taken >= room:
             kept.append((place, str(g)))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
 
 from acino_fte.data_tools.match_points import SOURCE_NAMES, SpacePoints
-from acino_fte.data_tools.plots_tracks_style import NAMED, colours_of, new_track_figure, runs
+from acino_fte.data_tools.plots_tracks_style import NAMED, colours_of, legend, new_track_figure, runs
 from acino_fte.plots_style import GREY, blank
 from acino_fte.report_scene import ground_grid
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from acino_fte.data_tools.track_matching import TrackMatches
 
-_WIDTH, _MARGIN, _GAP, _TOP = 9.6, 0.62, 0.62, 0.72
+_WIDTH, _MARGIN, _GAP, _TOP = 9.6, 0.62, 0.62, 0.9
 _MOST = 60_000  # points drawn in a panel
 _FLATTEST = 0.3  # of the longest side, so that a panel keeps some height
 _WITH_CAMERAS = 1.35  # cameras are shown when they do not stretch the picture more than this
@@ -51,15 +51,14 @@ def space_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
         scale *= (10.0 - _TOP - _GAP - _MARGIN) / (height - _TOP - _GAP - _MARGIN)
         height = 10.0
     figure = new_track_figure(matches, "3D tracks, a colour for each animal", _WIDTH, height, _TOP)
-    figure.text(
-        1 - 0.1 / _WIDTH,
-        1 - 0.33 / height,
-        "– seen   - - filled   ··· gap" + ("   △ camera" if centres else ""),
-        va="top",
-        ha="right",
-        fontsize=8.5,
-        color=GREY,
-    )
+    marks: list[tuple[str, dict[str, Any]]] = [
+        ("seen", {"ls": "-"}),
+        ("filled", {"ls": "--"}),
+        ("gap", {"ls": ":"}),
+    ]
+    if centres:
+        marks.append(("camera", {"ls": "", "marker": "^", "mfc": "white", "ms": 5}))
+    legend(figure, marks, 0.1, 0.56)
     colours = colours_of(matches.n_groups)
     w, d, h = scale * size
     left, upper = _MARGIN, _MARGIN + d + _GAP
@@ -130,6 +129,8 @@ def _flat_panel(
         axes.plot(*centre[:1, list(shown)].T, "^", color=GREY, ms=5, mfc="white", clip_on=False, zorder=3)
     axes.set_xlabel(f"{'xyz'[shown[0]]} (m)", labelpad=1)
     axes.set_ylabel(f"{'xyz'[shown[1]]} (m)", labelpad=1)
+    box = axes.get_window_extent().width / axes.figure.dpi
+    axes.locator_params(axis="x", nbins=int(np.clip(box / 0.55, 2, 9)))
     axes.grid(True, lw=0.3, color="#D5D5D5")
     axes.set_axisbelow(True)
 
@@ -177,7 +178,15 @@ def _name(axes: Axes, view: _Perspective, points: SpacePoints, colours: np.ndarr
     """A ring and the number of each animal where it is first."""
     group, first = np.unique(points.group, return_index=True)
     starts = view(points.position[first])
-    axes.scatter(*starts.T, s=9, facecolors="white", edgecolors=colours[group], linewidths=0.8, zorder=3)
+    axes.scatter(
+        starts[:, 0],
+        starts[:, 1],
+        s=9,
+        facecolors="white",
+        edgecolors=colours[group],
+        linewidths=0.8,
+        zorder=3,
+    )
     for name, place in zip(group, starts, strict=True):
         axes.annotate(
             str(name),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from acino_fte.plots_style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
 
@@ -48,12 +50,30 @@ def new_track_figure(
     last = recording.first_frame + max(recording.n_frames - 1, 0)
     where = (
         f"{recording.name} · {matches.n_groups} animals · {len(recording.views)} cameras · "
-        f"frames {recording.first_frame}–{last}"
+        f"frames {recording.first_frame} to {last}"
         + ("" if recording.fps is None else f" · {recording.fps:g} frames/s")
     )
     figure.text(0.1 / width, 1 - 0.09 / height, title, va="top", fontsize=13)
     figure.text(0.1 / width, 1 - 0.33 / height, where, va="top", fontsize=8.5, color=GREY)
     return figure
+
+
+def legend(figure: Figure, entries: Sequence[tuple[str, dict[str, Any]]], left: float, below: float) -> None:
+    """What the marks mean, in a line: (text, properties of a line), from `left`, `below` the top, in."""
+    width, height = figure.get_size_inches()
+    figure.legend(
+        [Line2D([], [], **{"color": GREY, **mark}) for _, mark in entries],
+        [text for text, _ in entries],
+        loc="upper left",
+        bbox_to_anchor=(left / width, 1 - below / height),
+        ncols=len(entries),
+        borderpad=0,
+        borderaxespad=0,
+        handlelength=1.5,
+        handletextpad=0.5,
+        columnspacing=1.6,
+        labelcolor=GREY,
+    )
 
 
 def runs(breaks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
 
 from acino_fte.data_tools.match_points import SpacePoints
-from acino_fte.data_tools.plots_tracks_style import colours_of, new_track_figure, runs
-from acino_fte.plots_style import blank, keys, margins
+from acino_fte.data_tools.plots_tracks_style import colours_of, legend, new_track_figure, runs
+from acino_fte.plots_style import blank, margins
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from acino_fte.data_tools.track_matching import TrackMatches
@@ -51,8 +52,9 @@ def timeline_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
     if n <= 40:
         axes.set_yticks(range(n), [str(g) for g in range(n)], fontsize=8 if n <= 25 else 6)
     axes.tick_params(axis="y", length=0 if n <= 40 else 3)
-    entries = list(zip(recording.cameras.names, (tuple(c) for c in colours), strict=True))[:12]
-    keys(figure, [(f"▬ {name}", colour) for name, colour in entries] + [("▬ 3D path", "#B5B5B5")], 0.65, 0.6)  # type: ignore[list-item]
+    shown = list(zip(recording.cameras.names, colours, strict=True))[:10]
+    marks: list[tuple[str, dict[str, Any]]] = [(name, {"lw": 4, "color": tuple(c)}) for name, c in shown]
+    legend(figure, [*marks, ("3D path", {"lw": 6, "color": _PATH})], 0.1, 0.56)
     return figure
 
 
@@ -65,7 +67,7 @@ def _bars(group: np.ndarray, frame: np.ndarray, bridged: int) -> np.ndarray:
     return np.stack([group[first], frame[first], frame[stop - 1]], axis=1)
 
 
-def _draw(axes, bars: np.ndarray, offset: float, colour, width: float) -> None:
+def _draw(axes: Axes, bars: np.ndarray, offset: float, colour: Any, width: float) -> None:
     y = bars[:, 0] + offset
     ends = np.stack(
         [np.stack([bars[:, 1] - 0.5, y], axis=1), np.stack([bars[:, 2] + 0.5, y], axis=1)], axis=1

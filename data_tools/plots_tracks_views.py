@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
 
 from acino_fte.data_tools.match_points import SpacePoints, predicted_pixels
-from acino_fte.data_tools.plots_tracks_style import NAMED, colours_of, new_track_figure, runs
-from acino_fte.plots_style import GREY, margins, nothing
+from acino_fte.data_tools.plots_tracks_style import NAMED, colours_of, legend, new_track_figure, runs
+from acino_fte.plots_style import BLUE, margins, nothing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,14 +36,7 @@ def overlay_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
     width = 0.75 + columns * (panel + 0.55)
     height = 0.95 + rows * (panel * min(shape, 1.4) + 0.55) + 0.1
     figure = new_track_figure(matches, "Matched tracks in every camera", width, height, 0.95)
-    figure.text(
-        0.1 / width,
-        1 - 0.53 / height,
-        _legend(matches, points),
-        va="top",
-        fontsize=8.5,
-        color=GREY,
-    )
+    legend(figure, _marks(matches, points), 0.1, 0.56)
     margins(figure, 0.7, 0.15, 0.5, wspace=0.55 / panel, hspace=0.55 / (panel * min(shape, 1.4)))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     colours = colours_of(matches.n_groups)
@@ -67,13 +61,16 @@ def _every(matches: TrackMatches) -> int:
     return max(1, -(-max(len(view) for view in matches.recording.views) // _MOST_DOTS))
 
 
-def _legend(matches: TrackMatches, points: SpacePoints) -> str:
+def _marks(matches: TrackMatches, points: SpacePoints) -> list[tuple[str, dict[str, Any]]]:
     every = _every(matches)
-    return (
-        "● matched, a colour for each animal   ● not matched: grey"
-        + ("   — 3D path" if len(points) <= _MOST_PATH else "")
-        + (f"   (dots of one frame in {every})" if every > 1 else "")
-    )
+    dots = "" if every == 1 else f" (of one frame in {every})"
+    marks: list[tuple[str, dict[str, Any]]] = [
+        (f"matched, a colour for each animal{dots}", {"ls": "", "marker": ".", "color": BLUE}),
+        ("not matched", {"ls": "", "marker": ".", "color": _UNMATCHED}),
+    ]
+    if len(points) <= _MOST_PATH:
+        marks.append(("3D path", {"lw": 0.6, "color": tuple(0.65 * np.array(to_rgb(BLUE)))}))
+    return marks
 
 
 def _limits(matches: TrackMatches, k: int) -> tuple[float, float, float, float]:
