@@ -212,6 +212,8 @@ def match(
                 show(step)
 
             tell("reading")
+            from acino_fte.cli_match_input import TrackInput, read_recording
+
             if method is _Method.thesis:
                 from acino_fte.data_tools.thesis_method import ThesisOptions
 
@@ -220,9 +222,9 @@ def match(
                 )
             else:
                 options = _match_options(noise_px, max_gap, encounter, follow, min_confidence)
-            recording = _read(
+            recording = read_recording(
                 folder,
-                _Input(
+                TrackInput(
                     cameras, tracks or [], truth, fps, resolution, camera_unit.value, node, cm_per_pixel, bare
                 ),
             )
@@ -244,26 +246,17 @@ def match(
         for message in metrics["warnings"][len(recording.warnings) :]:
             warn(message)
         if not quiet:
-            _summary(metrics, target)
+            from acino_fte.data_tools.match_numbers import summary
+
+            for line in summary(metrics):
+                stdout.print(line, markup=False)
+            stdout.print(f"written to {escape(str(target))}")
     if not metrics["n_animals"]:
         stderr.print(
             "[bold yellow]nothing was matched[/]: check that the camera file belongs to the tracks, that the "
             "frames of all cameras have one clock, and --noise-px"
         )
         raise typer.Exit(EXIT_OTHER)
-
-
-@dataclass(frozen=True)
-class _Input:
-    cameras: Path | None
-    tracks: list[str]
-    truth: Path | None
-    fps: float | None
-    resolution: str | None
-    camera_unit: str
-    node: str | None
-    cm_per_pixel: float | None
-    bare: bool
 
 
 def _target(folder: Path, out: Path | None) -> Path:
@@ -300,64 +293,6 @@ def _match_options(
         if value is not None and not 0 < value < float("inf"):
             raise InputError("The option is impossible.", key=key, expected="above 0", found=f"{value:g}")
     return MatchOptions(noise_px, max_gap, encounter, follow, min_confidence)
-
-
-def _read(folder: Path, given: _Input) -> TrackRecording:
-    """The recording of a folder."""
-    from dataclasses import replace
-
-    from acino_fte.data_tools.load_tracks import load_tracks
-
-    recording = load_tracks(
-        folder,
-        cameras=given.cameras,
-        tracks=_tracks(given.tracks),
-        fps=given.fps,
-        truth_3d=given.truth,
-        resolution=_resolution(given.resolution),
-        camera_unit=given.camera_unit,
-        node=given.node,
-        cm_per_pixel=given.cm_per_pixel,
-    )
-    if given.bare:
-        recording = replace(recording, views=tuple(view.without_tracks() for view in recording.views))
-    return recording
-
-
-def _tracks(given: list[str]) -> list[Path | str] | dict[str, Path | str] | None:
-    """Files of tracks, or camera → file."""
-    if not given:
-        return None
-    named = ["=" in text and not Path(text).exists() for text in given]
-    if not any(named):
-        return [Path(text) for text in given]
-    if not all(named):
-        raise InputError(
-            "Some files of tracks have the name of their camera and some have not.",
-            key="--tracks",
-            expected="CAMERA=FILE for all, or FILE for all",
-            found=", ".join(given),
-        )
-    pairs = [text.split("=", 1) for text in given]
-    names = [name for name, _ in pairs]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError("A camera is given two files of tracks.", key="--tracks", found=", ".join(twice))
-    return {name: Path(path) for name, path in pairs}
-
-
-def _resolution(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    parts = text.lower().replace("×", "x").split("x")
-    if len(parts) == 2 and all(part.strip().isdigit() and int(part) > 0 for part in parts):
-        return int(parts[0]), int(parts[1])
-    raise InputError(
-        "The size of the images cannot be read.",
-        key="--resolution",
-        expected="WIDTHxHEIGHT in px, such as 1920x1080",
-        found=text,
-    )
 
 
 def _match(recording: TrackRecording, options: Any, tell: Callable[[str], None]) -> TrackMatches:
@@ -406,48 +341,3 @@ def _spinner(quiet: bool) -> Iterator[Callable[[str], None]]:
     ) as bar:
         task = bar.add_task("", total=None)
         yield lambda text: bar.update(task, description=escape(text))
-
-
-def _summary(metrics: dict[str, Any], target: Path) -> None:
-    """What was found, on the terminal."""
-    begin, end = metrics["frames"]
-    lines = [f"{metrics['n_animals']} animals in {end - begin} frames of {metrics['n_cameras']} cameras"]
-    for name, view in metrics["cameras"].items():
-        share = f" ({view['matched_share']:.1%})" if view["rows"] else ""
-        lines.append(f"  {name}: {view['matched']} of {view['rows']} rows matched{share}")
-    noise, error = metrics["noise_px"]["total"], metrics["reprojection_px"]
-    if noise is not None:
-        slow = metrics["noise_px"]["slow"]
-        lines.append(f"noise {noise:.2f} px" + (f", {slow:.2f} px of it slow" if slow else ""))
-    if error["count"]:
-        lines.append(f"reprojection {error['median']:.2f} px median, {error['p90']:.2f} px in 90 %")
-    lines += _scores(metrics["truth"])
-    seconds = metrics["seconds"]
-    matching = seconds["total"] - sum(seconds.get(name, 0.0) for name in ("reading", "tables", "figures"))
-    lines.append(f"matched in {matching:.2f} s, {seconds['total']:.1f} s in all")
-    for line in lines:
-        stdout.print(line, markup=False)
-    stdout.print(f"written to {escape(str(target))}")
-
-
-def _scores(truth: dict[str, Any] | None) -> list[str]:
-    """Lines about the truth."""
-    if truth is None:
-        return []
-
-    def number(key: str) -> str:
-        return "–" if truth[key] is None else f"{truth[key]:.4f}"
-
-    lines = [
-        f"truth: pairing accuracy {number('pairing_accuracy')}, recall {number('recall')}, "
-        f"UDR {number('udr')} (at most {number('udr_ceiling')}), "
-        f"trajectories right {number('trajectories_right')}, identity switches {truth['identity_switches']}"
-    ]
-    position = truth.get("position_mm", {}).get("right_pairs", {})
-    if position.get("count"):
-        nees = truth["position_mm"]["nees_over_3"]
-        lines.append(
-            f"       3D error {position['mean']:.1f} mm mean, {position['median']:.1f} mm median"
-            + ("" if nees is None else f", NEES/3 {nees:.2f}")
-        )
-    return lines

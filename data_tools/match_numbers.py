@@ -205,3 +205,52 @@ def _animals(matches: TrackMatches, points: SpacePoints) -> tuple[np.ndarray, np
     most[seen[order, 0]] = seen[order, 1]
     agree = (low == high) & (high >= 0)
     return np.where(agree, high, most[points.group]), agree
+
+
+def summary(metrics: dict[str, Any]) -> list[str]:
+    """What was found, in lines for a terminal.
+
+    Parameters
+    ----------
+    metrics : dict
+        What ``metrics.json`` holds, with the seconds.
+    """
+    begin, end = metrics["frames"]
+    lines = [f"{metrics['n_animals']} animals in {end - begin} frames of {metrics['n_cameras']} cameras"]
+    for name, view in metrics["cameras"].items():
+        share = f" ({view['matched_share']:.1%})" if view["rows"] else ""
+        lines.append(f"  {name}: {view['matched']} of {view['rows']} rows matched{share}")
+    noise, error = metrics["noise_px"]["total"], metrics["reprojection_px"]
+    if noise is not None:
+        slow = metrics["noise_px"]["slow"]
+        lines.append(f"noise {noise:.2f} px" + (f", {slow:.2f} px of it slow" if slow else ""))
+    if error["count"]:
+        lines.append(f"reprojection {error['median']:.2f} px median, {error['p90']:.2f} px in 90 %")
+    lines += _scores(metrics["truth"])
+    seconds = metrics["seconds"]
+    matching = seconds["total"] - sum(seconds.get(name, 0.0) for name in ("reading", "tables", "figures"))
+    lines.append(f"matched in {matching:.2f} s, {seconds['total']:.1f} s in all")
+    return lines
+
+
+def _scores(truth: dict[str, Any] | None) -> list[str]:
+    """Lines about the truth."""
+    if truth is None:
+        return []
+
+    def number(key: str) -> str:
+        return "–" if truth[key] is None else f"{truth[key]:.4f}"
+
+    lines = [
+        f"truth: pairing accuracy {number('pairing_accuracy')}, recall {number('recall')}, "
+        f"UDR {number('udr')} (at most {number('udr_ceiling')}), "
+        f"trajectories right {number('trajectories_right')}, identity switches {truth['identity_switches']}"
+    ]
+    position = truth.get("position_mm", {}).get("right_pairs", {})
+    if position.get("count"):
+        nees = truth["position_mm"]["nees_over_3"]
+        lines.append(
+            f"       3D error {position['mean']:.1f} mm mean, {position['median']:.1f} mm median"
+            + ("" if nees is None else f", NEES/3 {nees:.2f}")
+        )
+    return lines
