@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -99,10 +99,6 @@ def match(
         float | None,
         typer.Option(help="TRex's setting, where its files do not say it.", rich_help_panel=_INPUT),
     ] = None,
-    bare: Annotated[
-        bool,
-        typer.Option("--bare", help="Forget the tracks: every dot by itself.", rich_help_panel=_INPUT),
-    ] = False,
     method: Annotated[
         _Method,
         typer.Option(
@@ -132,6 +128,14 @@ def match(
             rich_help_panel=_MATCHING,
         ),
     ] = 4.0,
+    bare: Annotated[
+        bool,
+        typer.Option(
+            "--bare",
+            help="Forget the tracks of the files; dots are joined to tracks anew.",
+            rich_help_panel=_MATCHING,
+        ),
+    ] = False,
     follow: Annotated[
         bool,
         typer.Option(
@@ -218,19 +222,26 @@ def match(
                 from acino_fte.data_tools.thesis_method import ThesisOptions
 
                 options: Any = ThesisOptions(
-                    sets, gate_m, gate_px, min_estimates, window, unchecked, fixed, vote
+                    sets=sets,
+                    gate_m=gate_m,
+                    gate_px=gate_px,
+                    min_estimates=min_estimates,
+                    window=window,
+                    unchecked=unchecked,
+                    fixed=fixed,
+                    vote=vote,
                 )
             else:
-                options = _match_options(noise_px, max_gap, encounter, follow, min_confidence)
+                options = _match_options(noise_px, max_gap, encounter, bare, follow, min_confidence)
             recording = read_recording(
                 folder,
                 TrackInput(
-                    cameras, tracks or [], truth, fps, resolution, camera_unit.value, node, cm_per_pixel, bare
+                    cameras, tracks or [], truth, fps, resolution, camera_unit.value, node, cm_per_pixel
                 ),
             )
             for message in recording.warnings:
                 warn(message)
-            matches = _match(recording, options, tell)
+            matches = _match(recording, options, bare, tell)
             clock.end()
             from acino_fte.data_tools.match_files import save_matches
 
@@ -285,24 +296,39 @@ def _formats(text: str) -> tuple[str, ...]:
 
 
 def _match_options(
-    noise_px: float | None, max_gap: float, encounter: float, follow: bool, min_confidence: float
+    noise_px: float | None,
+    max_gap: float,
+    encounter: float,
+    bare: bool,
+    follow: bool,
+    min_confidence: float,
 ) -> MatchOptions:
     from acino_fte.data_tools.track_matching import MatchOptions
 
     for key, value in (("--noise-px", noise_px), ("--max-gap", max_gap), ("--encounter", encounter)):
         if value is not None and not 0 < value < float("inf"):
             raise InputError("The option is impossible.", key=key, expected="above 0", found=f"{value:g}")
-    return MatchOptions(noise_px, max_gap, encounter, follow, min_confidence)
+    return MatchOptions(
+        noise_px=noise_px,
+        max_gap_s=max_gap,
+        encounter=encounter,
+        tracks=not bare,
+        follow=follow,
+        min_confidence=min_confidence,
+    )
 
 
-def _match(recording: TrackRecording, options: Any, tell: Callable[[str], None]) -> TrackMatches:
+def _match(recording: TrackRecording, options: Any, bare: bool, tell: Callable[[str], None]) -> TrackMatches:
     from acino_fte.data_tools.track_matching import MatchOptions, match_tracks
 
     if isinstance(options, MatchOptions):
         return match_tracks(recording, options, tell)
     from acino_fte.data_tools.match_methods import thesis_matches
 
-    return thesis_matches(recording, options, tell)
+    if not bare:
+        return thesis_matches(recording, options, tell)
+    views = tuple(view.without_tracks() for view in recording.views)
+    return replace(thesis_matches(replace(recording, views=views), options, tell), recording=recording)
 
 
 @dataclass

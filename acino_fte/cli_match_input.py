@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from acino_fte.data_tools.load_tracks import load_tracks
@@ -34,13 +34,12 @@ class TrackInput:
     camera_unit: str
     node: str | None
     cm_per_pixel: float | None
-    bare: bool
 
 
 def read_recording(folder: Path, given: TrackInput) -> TrackRecording:
     """The recording of a folder; errors name the options of the command."""
     try:
-        recording = load_tracks(
+        return load_tracks(
             folder,
             cameras=given.cameras,
             tracks=_tracks(given.tracks),
@@ -53,9 +52,6 @@ def read_recording(folder: Path, given: TrackInput) -> TrackRecording:
         )
     except InputError as error:
         raise _in_flags(error) from None
-    if given.bare:
-        recording = replace(recording, views=tuple(view.without_tracks() for view in recording.views))
-    return recording
 
 
 def _in_flags(error: InputError) -> InputError:

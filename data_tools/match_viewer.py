@@ -33,7 +33,7 @@ SCRIPT = """
   slider.min = data.first; slider.max = data.last;
   let frame = data.last, playing = false, begun = 0, from = 0, view, eye;
   function reset() {
-    view = { yaw: -1.05, pitch: 0.42, distance: 1.5 * data.size, target: data.middle.slice() };
+    view = { yaw: -1.05, pitch: 0.42, distance: 1.1 * data.size, target: data.middle.slice() };
   }
   reset();
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];

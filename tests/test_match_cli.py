@@ -105,13 +105,8 @@ def test_options_reach_the_matching(recording, here):
     chosen = ("--noise-px", 4, "--max-gap", 0.5, "--encounter", 5, "--no-follow", "--min-confidence", 0.9)
     assert match(recording, "-q", "--no-figures", "-o", "out", *chosen).exit_code == 0
     found = metrics_of("out")
-    assert found["options"] == {
-        "noise_px": 4.0,
-        "max_gap_s": 0.5,
-        "encounter": 5.0,
-        "follow": False,
-        "min_confidence": 0.9,
-    }
+    expected = {"noise_px": 4.0, "max_gap_s": 0.5, "encounter": 5.0, "follow": False, "min_confidence": 0.9}
+    assert found["options"].items() >= expected.items()
     assert found["noise_px"]["total"] == 4.0
     assert set(found["points_3d"]["by_source"]) == {"triangulated"}
 
@@ -143,10 +138,17 @@ def test_files_can_be_named(recording, here, tmp_path):
     assert metrics_of("out")["n_animals"] == 4
 
 
-def test_tracks_can_be_forgotten(recording, here):
-    assert match(recording, "-q", "--no-figures", "-o", "out", "--bare").exit_code in (0, 1)
-    assert pd.read_csv("out/observations.csv").track.isna().all()
-    assert metrics_of("out")["cameras"]["cam0"]["tracks"] == 0
+@pytest.mark.parametrize("method", ["tracks", "thesis"])
+def test_tracks_can_be_forgotten(recording, here, method):
+    """The names of the tracks stay in the tables, but nothing comes of them."""
+    result = match(recording, "-q", "--no-figures", "-o", "out", "--bare", "--method", method)
+    assert result.exit_code == 0, result.output
+    table = pd.read_csv("out/observations.csv")
+    given = pd.read_csv(recording / "cam0.csv")
+    np.testing.assert_array_equal(table.track[: len(given)], given.track)
+    assert metrics_of("out")["truth"]["pairing_accuracy"] > 0.5
+    if method == "tracks":
+        assert not metrics_of("out")["options"]["tracks"]
 
 
 def test_rows_without_coordinates_are_told_and_kept(mine, here):
