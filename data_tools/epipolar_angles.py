@@ -1,16 +1,16 @@
 """Which plane through two camera centres a dot lies in: one number a dot that both cameras agree on.
 
 All planes that hold the baseline of two cameras form a pencil; a point in space lies on one half plane of it,
-and both cameras see it there, whatever their lenses (Pollefeys, Koch and Van Gool 1999, *A simple and efficient
-rectification method for general motion*, use the same angle to rectify images). With a ray d (unit, world) and
-an orthonormal frame (e, e1, e2) whose e runs along the baseline,
+and both cameras see it there, whatever their lenses (Pollefeys, Koch and Van Gool 1999, *A simple and
+efficient rectification method for general motion*, use the same angle to rectify images). With a ray d (unit,
+world) and an orthonormal frame (e, e1, e2) whose e runs along the baseline,
 
     θ = atan2(d·e2, d·e1),        ∂θ/∂d = (e2 (d·e1) − e1 (d·e2)) / ((d·e1)² + (d·e2)²)
 
-and the distance of two dots, θ_a − θ_b over the root of the sum of their squared slopes g = |∂θ/∂pixel|, is to
-first order the Sampson distance in pixels of the raw images: its standard deviation is that of the pixels, near
-an epipole and in a fisheye too. So a pair of cameras needs two numbers a dot, not a matrix product a pair of
-dots, and the dots near a plane are found by sorting.
+and the distance of two dots, θ_a − θ_b over the root of the sum of their squared slopes g = |∂θ/∂pixel|, is
+to first order the Sampson distance in pixels of the raw images: its standard deviation is that of the pixels,
+near an epipole and in a fisheye too. So a pair of cameras needs two numbers a dot, not a matrix product a
+pair of dots, and the dots near a plane are found by sorting.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ def rays_of(camera: Camera, frame: np.ndarray, xy: np.ndarray) -> Rays:
     Parameters
     ----------
     camera : Camera
+        Fixed or moving.
     frame : (P,) int
         Row of the camera's poses; not looked at when the camera does not move.
     xy : (P, 2)
@@ -81,8 +82,8 @@ class PlaneAngles:
     slope : (P,)
         g = |∂θ/∂pixel|, rad/px.
     along : (P,)
-        Angle of the ray from the baseline (from camera a to camera b), rad. The rays of two dots meet in front
-        of both cameras when it is larger at b than at a.
+        Angle of the ray from the baseline (from camera a to camera b), rad. The rays of two dots meet in
+        front of both cameras when it is larger at b than at a.
     """
 
     angle: np.ndarray
@@ -98,6 +99,7 @@ def plane_angles(
     Parameters
     ----------
     cameras : CameraArray
+        Of the recording.
     a, b : int
         Which two.
     frames : pair of (P,) int

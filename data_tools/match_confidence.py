@@ -1,8 +1,8 @@
 """How sure is a match? The posterior probability of every piece's place, and what else it might have been.
 
-With everything else as it is, a piece may stay, be alone, go to another group, or change places with what that
-group holds in its view at the time. The log-odds of each alternative against the present state come from the same
-sums that made the groups, and
+With everything else as it is, a piece may stay, be alone, go to another group, or change places with what
+that group holds in its view at the time. The log-odds of each alternative against the present state come from
+the same sums that made the groups, and
 
     P(right) = 1 / (1 + Σ exp(log-odds of an alternative)).
 """
@@ -48,6 +48,7 @@ def confidence_of(graph: PieceGraph, label: np.ndarray) -> Confidence:
     Parameters
     ----------
     graph : PieceGraph
+        The evidence.
     label : (V,) int
         Group of every piece.
     """
@@ -83,7 +84,7 @@ def _gains(graph: PieceGraph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _displaced(
     graph: PieceGraph, label: np.ndarray, own: np.ndarray, piece: np.ndarray, group: np.ndarray
 ) -> np.ndarray:
-    """What the pieces lose, less what they may gain in exchange, that are in a group when a piece comes, (E,)."""
+    """What pieces that are in a group when another comes may gain in exchange, less what they lose, (E,)."""
     by_group = np.argsort(label, kind="stable")
     low = np.searchsorted(label[by_group], group)
     count = np.searchsorted(label[by_group], group, side="right") - low

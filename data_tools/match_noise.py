@@ -1,11 +1,11 @@
 """How far the dots of one animal are from one epipolar plane, from the recording itself.
 
-Before anything is matched: for some windows of 16 frames of the tracks of one view, the window of the other view
-that is nearest in all of them, provided it is within a wide reach in nearly all. Windows in which a track changes
-hands have no partner, or one by chance that is far off, so the noise is the lowest peak of the logarithms of the
-mean squares, and the reach, a share of the image's diagonal, is made wider until there is one well inside it.
-After matching, the noise is that of the matched dots: σ from the scatter of d about the mean of a chunk of frames,
-σ_s from what the means of the chunks scatter beyond that.
+Before anything is matched: for some windows of 16 frames of the tracks of one view, the window of the other
+view that is nearest in all of them, provided it is within a wide reach in nearly all. Windows in which a
+track changes hands have no partner, or one by chance that is far off, so the noise is the lowest peak of the
+logarithms of the mean squares, and the reach, a share of the image's diagonal, is made wider until there is
+one well inside it. After matching, the noise is that of the matched dots: σ from the scatter of d about the
+mean of a chunk of frames, σ_s from what the means of the chunks scatter beyond that.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Where a track goes from one animal to another, as another view tells it.
 
-A tracker exchanges two animals when they meet, or takes another one up after a gap. In the other views the track
-then has one partner before and one after. For each piece, the partner in every frame is found by dynamic
-programming (Viterbi 1967): a dot of the partner within reach earns `chance − ½ (d/σ)²`, a dot beyond it costs
-½ reach², a partner that is not seen says nothing, having none earns nothing, and every change costs as much as the
-evidence asked for. A piece is cut where the best partner changes.
+A tracker exchanges two animals when they meet, or takes another one up after a gap. In the other views the
+track then has one partner before and one after. For each piece, the partner in every frame is found by
+dynamic programming (Viterbi 1967): a dot of the partner within reach earns `chance − ½ (d/σ)²`, a dot beyond
+it costs ½ reach², a partner that is not seen says nothing, having none earns nothing, and every change costs
+as much as the evidence asked for. A piece is cut where the best partner changes.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ def find_changes(
     side : {0, 1}
         The view to look at.
     noise : Noise
+        Of a dot's coordinate.
     doubtful : (K,) bool
         Pieces of it to look at.
 

@@ -1,10 +1,11 @@
 """3D paths drop the dots that do not belong to them, and claim loose ones.
 
-A piece of track that lies further from what all other dots of its animal predict than noise allows leaves it; the
-paths of one animal on both sides of a gap are joined (:mod:`track_joins`). A dot that no animal has, because a detector lost it in an encounter or its piece was too short to decide, goes to the animal
-whose path runs through it: with the squared distance z from the predicted pixel, the determinant |S| of its
-covariance and the density ρ of loose dots, the odds of the pair are exp(−z/2)/(2π √|S| ρ); in every frame and view
-the claims are settled together, and one that another claim makes uncertain is left.
+A piece of track that lies further from what all other dots of its animal predict than noise allows leaves it;
+the paths of one animal on both sides of a gap are joined (:mod:`track_joins`). A dot that no animal has,
+because a detector lost it in an encounter or its piece was too short to decide, goes to the animal whose path
+runs through it: with the squared distance z from the predicted pixel, the determinant |S| of its covariance
+and the density ρ of loose dots, the odds of the pair are exp(−z/2)/(2π √|S| ρ); in every frame and view the
+claims are settled together, and one that another claim makes uncertain is left.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ _GATE = 16.0
 _BEYOND = 8
 _NEVER = 1e3
 _SURE = 0.9
+_MOST_ROUNDS, _FEW = 12, 0.003
 
 
 def claim_loose_dots(matches: TrackMatches, max_gap: int) -> TrackMatches:
@@ -38,17 +40,24 @@ def claim_loose_dots(matches: TrackMatches, max_gap: int) -> TrackMatches:
     Parameters
     ----------
     matches : TrackMatches
+        Before.
     max_gap : int
         Longest gap that a path bridges, frames.
     """
-    paths = _paths(matches, max_gap, min(max_gap, _BEYOND))
-    kept = _without_strangers(matches, paths)
-    group = np.append(join_paths(paths, kept, max_gap), -1)
-    claimed = _with_claims(kept, paths)
-    joined = replace(claimed, groups=tuple(group[g] for g in claimed.groups), rival=group[claimed.rival])
-    same = all(np.array_equal(a, b) for a, b in zip(matches.groups, joined.groups, strict=True))
-    paths = _without_extension(paths) if same else _paths(joined, max_gap, motion=paths.motion)
-    return replace(joined, trajectories=paths)
+    n_rows = sum(len(view) for view in matches.recording.views)
+    for _ in range(_MOST_ROUNDS):
+        paths = _paths(matches, max_gap, min(max_gap, _BEYOND))
+        kept = _without_strangers(matches, paths)
+        group = np.append(join_paths(paths, kept, max_gap), -1)
+        claimed = _with_claims(kept, paths)
+        joined = replace(claimed, groups=tuple(group[g] for g in claimed.groups), rival=group[claimed.rival])
+        won = sum(int((a != b).sum()) for a, b in zip(kept.groups, claimed.groups, strict=True))
+        same = all(np.array_equal(a, b) for a, b in zip(matches.groups, joined.groups, strict=True))
+        matches = joined
+        if won <= _FEW * n_rows:
+            break
+    paths = _without_extension(paths) if same else _paths(matches, max_gap, motion=paths.motion)
+    return replace(matches, trajectories=paths)
 
 
 def _paths(
@@ -80,8 +89,8 @@ def _without_extension(paths: Trajectories) -> Trajectories:
 def _without_strangers(matches: TrackMatches, paths: Trajectories) -> TrackMatches:
     """Pieces most of whose dots are not on their group's path leave it.
 
-    A tracker's piece was cut wherever another view contradicts it, so its dots are of one animal; a few of them
-    off the path tell of a sudden turn.
+    A tracker's piece was cut wherever another view contradicts it, so its dots are of one animal; a few of
+    them off the path tell of a sudden turn.
     """
     n = len(matches.rival)
     off, all_ = np.zeros(n + 1), np.zeros(n + 1)
@@ -142,8 +151,8 @@ def _claims(matches: TrackMatches, paths: Trajectories, k: int) -> tuple[np.ndar
 def _settle(row: np.ndarray, point: np.ndarray, odds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Claims (E) settled together: the chosen ones, and their probabilities.
 
-    The sum of the log-odds is made largest. The alternatives to a claim are none, another point or another row
-    for it, and an exchange with another claim.
+    The sum of the log-odds is made largest. The alternatives to a claim are none, another point or another
+    row for it, and an exchange with another claim.
     """
     rows, i = np.unique(row, return_inverse=True)
     points, j = np.unique(point, return_inverse=True)

@@ -1,20 +1,21 @@
 """How well pieces of 2D tracks in two views agree, as log-odds of being one animal.
 
-In a frame that two pieces share, one animal gives plane angles that differ by noise, d ~ N(0, σ²) px; two animals
-give any difference, with the density of the dots of the recording. But two animals that stay where they are, or
-keep to one plane for long, are near each other in many frames by one chance: their frames are not independent
-looks. A piece's *memory* L is how long it takes to move away from a plane by two standard deviations, and n shared
-frames hold n/L looks of n_b = L frames each. Inside a look the mean of d is one draw of a coincidence, and the
-scatter about it tells nothing. With a slow part σ_s of the noise (calibration, a dot that is not the same spot of
-the body in both views), the log of the Bayes factor of a look is
+In a frame that two pieces share, one animal gives plane angles that differ by noise, d ~ N(0, σ²) px; two
+animals give any difference, with the density of the dots of the recording. But two animals that stay where
+they are, or keep to one plane for long, are near each other in many frames by one chance: their frames are
+not independent looks. A piece's *memory* L is how long it takes to move away from a plane by two standard
+deviations, and n shared frames hold n/L looks of n_b = L frames each. Inside a look the mean of d is one draw
+of a coincidence, and the scatter about it tells nothing. With a slow part σ_s of the noise (calibration, a
+dot that is not the same spot of the body in both views), the log of the Bayes factor of a look is
 
     log N(d̄; 0, v) − log p(d̄ | others) = chance + ½ log((σ² + σ_s²)/v) − ½ d̄²/v,     v = σ²/n_b + σ_s²
 
-where chance = −log(√(2π) √(σ² + σ_s²) · density of another animal's dots along d). The sum over the looks, less
-log m for the m animals in view of which any might have been the one, is the weight W. The sum of d̄²/v is taken
-over blocks no longer than a look (frames, chunks of 64 frames, or all), which has the same mean, with as much
-added as the additional blocks take away. A frame in which the dots are beyond reach costs ½ reach²; one in fifty is free, for
-the dots of real detectors that are somewhere else.
+where chance = −log(√(2π) √(σ² + σ_s²) · density of another animal's dots along d). The sum over the looks,
+less log m for the m animals in view of which any might have been the one, is the weight W. The sum of d̄²/v
+is taken over blocks no longer than a look (frames, chunks of 64 frames, or all), which has the same mean,
+with as much added as the additional blocks take away; scatter inside a block counts only where it is clearly
+too large. A frame in which the dots are beyond reach costs ½ reach²; one in fifty is free, for the dots of
+real detectors that are somewhere else.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def near_dots(
 def _near_in_chunk(
     a: Dots, b: Dots, rows_a: np.ndarray, rows_b: np.ndarray, reach: float
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Sort the second view's dots by (frame, angle); look up the first view's, once a turn around the pencil."""
+    """Sort the second view's dots by frame and angle; look up the first view's, once a turn of the pencil."""
     slope_a, slope_b = a.angles.slope[rows_a], b.angles.slope[rows_b]
     angle_a, angle_b = a.angles.angle[rows_a], b.angles.angle[rows_b]
     key_b = b.frame[rows_b] * _SPAN + angle_b
@@ -250,15 +251,22 @@ def _weights(a: Dots, b: Dots, noise: Noise, e: Evidence) -> np.ndarray:
     frames_a_look = shared / looks
     spread = noise.white**2 / frames_a_look + noise.slow**2
     whole = e.sums**2 / near / (noise.white**2 + near * noise.slow**2)
+    frames, chunks = e.squares / noise.total**2 - e.near, e.between - e.chunks
+    fine, coarse = _clearly_too_large(frames, e.near), _clearly_too_large(chunks, e.chunks)
     misfit = np.select(
         [memory < _CHUNK / 4, memory < shared / 4],
-        [e.squares / noise.total**2 - e.near, e.between - e.chunks],
-        whole - 1.0,
+        [frames, chunks + fine],
+        whole - 1.0 + np.maximum(fine, coarse),
     )
     per_look = chance + 0.5 * np.log(noise.total**2 / spread) - 0.5
     others = np.log(0.5 * (animals_in_view(a) + animals_in_view(b)))
     far = np.maximum(e.shared - e.near - _STRAY * e.shared, 0.0)
     return looks * per_look - 0.5 * misfit - 0.5 * REACH**2 * far - others
+
+
+def _clearly_too_large(excess: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """What a χ² exceeds its degrees of freedom by, beyond three standard deviations and a tenth, or 0."""
+    return np.maximum(excess - 3.0 * np.sqrt(2.0 * freedom) - 0.1 * freedom, 0.0)
 
 
 def animals_in_view(dots: Dots) -> float:

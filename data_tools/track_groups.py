@@ -4,10 +4,10 @@ Every edge between two pieces carries log-odds of being one animal; a group is w
 every pair of views and along time, so views that disagree pay for it, and a third view decides what two leave
 open. Two pieces of one view that are there at the same time are never one animal.
 
-The largest sum is sought by joining groups from the surest pair to the least sure (edge contraction, as Keuper
-et al. 2015, *Efficient decomposition of image and mesh graphs by lifted multicuts*, but by margin instead of by
-gain): the *margin* of a pair is its log-odds against everything it would exclude. What is open at first, two
-birds on one perch, is left until pieces joined meanwhile have pooled their evidence.
+The largest sum is sought by joining groups from the surest pair to the least sure (edge contraction, as
+Keuper et al. 2015, *Efficient decomposition of image and mesh graphs by lifted multicuts*, but by margin
+instead of by gain): the *margin* of a pair is its log-odds against everything it would exclude. What is open
+at first, two birds on one perch, is left until pieces joined meanwhile have pooled their evidence.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ def group_pieces(graph: PieceGraph, least: float = 0.0) -> np.ndarray:
     Parameters
     ----------
     graph : PieceGraph
+        The evidence.
     least : float
         Margin, log-odds, above which two groups are joined.
     """
@@ -95,6 +96,7 @@ def total_log_odds(graph: PieceGraph, label: np.ndarray) -> tuple[np.ndarray, np
     Parameters
     ----------
     graph : PieceGraph
+        The evidence.
     label : (V,) int
         Group of every piece; any numbers from 0.
 
@@ -156,7 +158,7 @@ _ONES = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8
 
 
 def _totals(edges: _Edges, occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log-odds of each pair of groups with the overlaps that have no edge, and whether it can be one animal."""
+    """Log-odds of each pair of groups, overlaps without an edge included; whether it can be one animal."""
     views = range(occupied.shape[1])
     overlap = np.zeros(len(edges.u))
     compatible = np.ones(len(edges.u), dtype=bool)

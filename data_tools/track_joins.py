@@ -1,12 +1,13 @@
 """Paths of one animal on both sides of a gap, joined in space.
 
-A group ends where all its views lose it, and another begins. Both paths are carried on by their motion prior; in the
-frame in the middle of the gap they are at places x_A and x_B with covariances S_A and S_B. With ρ the rate at which
-groups begin (1/m³ and frame), the log-odds of their being one animal are
+A group ends where all its views lose it, and another begins. Both paths are carried on by their motion prior;
+in the frame in the middle of the gap they are at places x_A and x_B with covariances S_A and S_B. With ρ the
+rate at which groups begin (1/m³ and frame), the log-odds of their being one animal are
 
     log N(x_A − x_B; 0, S_A + S_B) − log(ρ · gap)
 
-and, as with pieces of tracks, only those count that stand out against every other continuation of either path.
+and, as with pieces of tracks, only those count that stand out against every other continuation of either
+path.
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ _LIKELY = -3.0
 
 
 def join_paths(paths: Trajectories, matches: TrackMatches, max_gap: int) -> np.ndarray:
-    """New number of every group, (G,): joined ones get the number of the earliest, without gaps in the numbers.
+    """New number of every group, (G,), from 0 without gaps; joined groups get one number.
 
     Parameters
     ----------
     paths : Trajectories
         With some frames beyond both ends.
     matches : TrackMatches
+        Whose groups the paths are.
     max_gap : int
         Longest gap, frames.
     """

@@ -1,10 +1,11 @@
-"""Does a piece of track go on as another piece of the same view? Log-odds from how the animals move in the image.
+"""Does a piece of track go on as another piece of the same view? Log-odds from how the animals move.
 
-A piece is carried on from its end in a straight line, the later one backwards from its beginning. How far such
-guesses miss after a gap of g frames is learnt from the unbroken tracks of the same view, in units of the root of
-the noise and of the animal's own last steps, so that a bird on a perch and a bird in flight both get their due.
-The odds set the density of the miss (Student's t: animals turn) against the rate of pieces that begin there for
-another reason, and then against all other continuations of either piece: only an unambiguous link counts.
+A piece is carried on from its end in a straight line, the later one backwards from its beginning. How far
+such guesses miss after a gap of g frames is learnt from the unbroken tracks of the same view, in units of the
+root of the noise and of the animal's own last steps, so that a bird on a perch and a bird in flight both get
+their due. The odds set the density of the miss (Student's t: animals turn) against the rate of pieces that
+begin there for another reason, and then against all other continuations of either piece: only an unambiguous
+link counts.
 """
 
 from __future__ import annotations
@@ -65,6 +66,7 @@ def link_pieces(pieces: ViewPieces, noise: float, max_gap: int) -> tuple[np.ndar
     Parameters
     ----------
     pieces : ViewPieces
+        Of one view.
     noise : float
         σ, px.
     max_gap : int
@@ -104,7 +106,10 @@ def link_pieces(pieces: ViewPieces, noise: float, max_gap: int) -> tuple[np.ndar
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """One end of every piece: place (K, 2), velocity (K, 2) away from the piece, px/frame, scale (K,), px; still."""
+    """One end of every piece.
+
+    Place (K, 2), px; velocity away from the piece (K, 2), px/frame; scale (K,), px; whether it is still (K,).
+    """
 
     place: np.ndarray
     velocity: np.ndarray
@@ -120,8 +125,8 @@ class _Ends:
 def _ends(pieces: ViewPieces, noise: float, forwards: bool) -> _Ends:
     """Place and velocity of one end of every piece.
 
-    The last dots are averaged over the longest run of 2, 4, 8 … of them whose halves agree within the noise; a
-    piece that stands still so far has no velocity. Otherwise the velocity is that of the last few dots.
+    The last dots are averaged over the longest run of 2, 4, 8 … of them whose halves agree within the noise;
+    a piece that stands still so far has no velocity. Otherwise the velocity is that of the last few dots.
     """
     rows = pieces.start[1:] - 1 if forwards else pieces.start[:-1]
     n_dots = np.diff(pieces.start)
@@ -249,8 +254,8 @@ def _against_chance(
 ) -> np.ndarray:
     """Log-odds of each link against a piece that begins there by chance.
 
-    Both the distribution of the gaps and the rate of beginnings that no link explains (1/px² and frame) are those
-    of the recording: the links that are likely so far are counted, three times over.
+    Both the distribution of the gaps and the rate of beginnings that no link explains (1/px² and frame) are
+    those of the recording: the links that are likely so far are counted, three times over.
     """
     size = np.ptp(pieces.xy, axis=0) + 1.0
     frames = float(pieces.frame.max() - pieces.frame.min() + 1)
@@ -280,7 +285,7 @@ def _candidates(pieces: ViewPieces, max_gap: int) -> tuple[np.ndarray, np.ndarra
 
 
 def _useful_gap(pieces: ViewPieces, tail: _Ends, model: _Model, max_gap: int) -> int:
-    """The longest gap before which fewer than a few other pieces begin where even a calm animal may have got to."""
+    """Longest gap in which few other pieces begin where even a calm animal may have got to, frames."""
     calm = np.quantile(tail.scale, _CALM) * np.minimum(model.line, model.none)
     spread = np.minimum(calm, np.maximum(model.rest, calm / _LONGEST)) if tail.still.mean() > _CALM else calm
     size = np.ptp(pieces.xy, axis=0) + 1.0
@@ -310,7 +315,7 @@ def _within_reach(
 
 
 def _rivals(who: np.ndarray, other: np.ndarray, odds: np.ndarray, pieces: ViewPieces) -> np.ndarray:
-    """Log of one (no link) and the odds of the links of the same piece to others that this one excludes, (E,).
+    """Log of one (no link) plus the odds of the links of the same piece that this one excludes, (E,).
 
     Two continuations exclude each other when they are there at the same time.
     """

@@ -4,15 +4,19 @@
 >>> matches = match_tracks(load_tracks("recording"))            # doctest: +SKIP
 >>> matches.groups[0]      # the animal of every row of the first view, −1 where unknown  # doctest: +SKIP
 
-Tracks decide, not frames: a dot is near many epipolar lines, a track stays near one. In the order of the work:
+Tracks decide, not frames: a dot is near many epipolar lines, a track stays near one. In the order of the
+work:
 
+0. bare points are joined to pieces of track within their view (:mod:`dot_linking`);
 1. every dot's plane angle in every pair of views (:mod:`epipolar_angles`); the noise, from the data
    (:mod:`match_noise`);
 2. pieces of tracks that plainly continue one another are stitched within each view (:mod:`track_links`);
-3. the evidence between pieces of different views (:mod:`track_evidence`), and how likely a piece has a partner at
+3. the evidence between pieces of different views (:mod:`track_evidence`), and how likely a piece has a
+partner at
    all (:mod:`track_prior`);
 4. groups, one an animal, over all views (:mod:`track_groups`, :mod:`track_reassignment`);
-5. pieces that the groups contradict are cut, at encounters (:mod:`track_pieces`) and where another view tells that
+5. pieces that the groups contradict are cut, at encounters (:mod:`track_pieces`) and where another view tells
+that
    the animal changed (:mod:`track_changes`), and grouped anew;
 6. the groups' 3D paths drop dots that do not belong and claim loose ones (:mod:`track_claims`);
 7. the probability of every match (:mod:`match_confidence`).
@@ -27,6 +31,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acino_fte.data_tools.dot_linking import link_dots
 from acino_fte.data_tools.epipolar_angles import PlaneAngles, plane_angles, rays_of
 from acino_fte.data_tools.match_confidence import Confidence, confidence_of
 from acino_fte.data_tools.match_noise import first_noise, matched_noise
@@ -39,7 +44,7 @@ from acino_fte.data_tools.track_links import link_pieces
 from acino_fte.data_tools.track_pieces import PiecedView, cut_at, cut_at_encounters, pieced
 from acino_fte.data_tools.track_prior import partner_log_odds
 from acino_fte.data_tools.track_reassignment import reassign
-from acino_fte.data_tools.tracks2d import TrackRecording
+from acino_fte.data_tools.tracks2d import BARE, TrackRecording, Tracks2D
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,7 +53,7 @@ if TYPE_CHECKING:
 _STITCH = 4.0
 _NOISE_CHANGED = 0.04
 _FPS = 30.0
-_MOST_CUTS = 4
+_MOST_CUTS, _MOST_NOISE = 4, 4
 _LONG, _FAR_SHARE, _FAR_FRAMES = 10, 0.05, 1.0
 
 Progress = Callable[[str], None]
@@ -66,6 +71,8 @@ class MatchOptions:
         Longest gap within a view across which a piece of track is continued, s.
     encounter : float
         Dots of one view closer than this, in standard deviations of the noise, may have been exchanged.
+    tracks : bool
+        Whether the tracker's tracks are used; if not, all dots are taken as bare points.
     follow : bool
         Whether 3D paths drop dots that do not belong to them and claim loose ones.
     min_confidence : float
@@ -75,6 +82,7 @@ class MatchOptions:
     noise_px: float | None = None
     max_gap_s: float = 1.0
     encounter: float = 4.0
+    tracks: bool = True
     follow: bool = True
     min_confidence: float = 0.5
 
@@ -91,8 +99,8 @@ class TrackMatches:
     confidence : tuple of (P,)
         For each view: probability that the row's group is right; NaN for none.
     pieces : tuple of (P,) int
-        For each view: the piece of track that the row was matched with, −1 for none; a number a piece over all
-        views.
+        For each view: the piece of track that the row was matched with, −1 for none; a number a piece over
+        all views.
     rival, rival_probability : (V,)
         For each piece: the most likely other group (−1: none) and its probability.
     noise : Noise
@@ -126,6 +134,7 @@ def match_tracks(
     recording : TrackRecording
         Two views or more.
     options : MatchOptions, optional
+        By default everything is estimated.
     progress : callable, optional
         Called with the name of every step.
 
@@ -143,7 +152,9 @@ def match_tracks(
     matching.stitch()
     tell("matching")
     matching.group()
-    if matching.renew_noise(options.noise_px):
+    for _ in range(_MOST_NOISE):
+        if not matching.renew_noise(options.noise_px):
+            break
         matching.group()
     for cut in range(_MOST_CUTS):
         doubtful = matching.contradicted()
@@ -164,7 +175,9 @@ class _Matching:
         _check(recording)
         self.recording, self.options = recording, options
         first = recording.first_frame
-        self.views: list[PiecedView] = [pieced(v.frame - first, v.track, v.xy) for v in recording.views]
+        self.views: list[PiecedView] = [
+            pieced(view.frame - first, _tracks(view, options), view.xy) for view in recording.views
+        ]
         self.max_gap = max(1, round(options.max_gap_s * (recording.fps or _FPS)))
         self.angles = self._plane_angles()
         self.noise = Noise(1.0)
@@ -268,7 +281,7 @@ class _Matching:
         return change > _NOISE_CHANGED
 
     def contradicted(self) -> list[np.ndarray]:
-        """For each view, the pieces that their group's other views often do not see, and long ones that match none."""
+        """For each view: pieces that other views of their group contradict, and long ones that match none."""
         offsets = self.offsets
         shared, far = np.zeros(len(self.label)), np.zeros(len(self.label))
         for (a, b), e in self.evidence.items():
@@ -331,6 +344,18 @@ class _Matching:
             tell("3D paths")
             matches = claim_loose_dots(matches, self.max_gap)
         return matches
+
+
+def _tracks(view: Tracks2D, options: MatchOptions) -> np.ndarray:
+    """Track of every row, with bare points joined to pieces within the view; −1 for what stays alone."""
+    track = view.track if options.tracks else np.full(len(view), BARE)
+    bare = np.flatnonzero(track == BARE)
+    if not len(bare):
+        return track
+    piece = link_dots(view.frame[bare], view.xy[bare], options.noise_px)
+    track = track.copy()
+    track[bare] = np.where(piece >= 0, piece + track.max(initial=BARE) + 1, BARE)
+    return track
 
 
 def _of_piece(values: np.ndarray, piece: np.ndarray, otherwise: float) -> np.ndarray:

@@ -1,9 +1,10 @@
 """For how long does one look at an animal last? The memory of a piece of track.
 
-Two animals that are near one plane by chance stay near it until one of them moves. The memory L of a piece is the
-lag, in frames, after which it has left its plane by two standard deviations of the noise: from the mean squared
-change of θ over lags 1, 2, 4 …, in px, less the noise's own 2σ². Members of a flock leave a plane together, so the
-memory is no shorter than that of the angle *between* the piece and those next to it in the view.
+Two animals that are near one plane by chance stay near it until one of them moves. The memory L of a piece is
+the lag, in frames, after which it has left its plane by two standard deviations of the noise: from the mean
+squared change of θ over lags 1, 2, 4 …, in px, less the noise's own 2σ². Members of a flock leave a plane
+together, so the memory is no shorter than that of the angle *between* the piece and those next to it in the
+view.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ def memories(dots: Dots, noise: float) -> np.ndarray:
     Parameters
     ----------
     dots : Dots
+        Of one view.
     noise : float
         σ, px.
     """

@@ -1,8 +1,8 @@
 """Tracks of one view in pieces that hold one animal each, as far as can be known.
 
-A piece begins as a track of the tracker. Where the other views contradict it, it is cut at its encounters: the
-frames in which another dot of the same view comes so close that a tracker may have exchanged the two. The dots
-inside an encounter belong to no piece.
+A piece begins as a track of the tracker. Where the other views contradict it, it is cut at its encounters:
+the frames in which another dot of the same view comes so close that a tracker may have exchanged the two. The
+dots inside an encounter belong to no piece.
 """
 
 from __future__ import annotations
@@ -65,13 +65,14 @@ def pieced(frame: np.ndarray, track: np.ndarray, xy: np.ndarray) -> PiecedView:
 
 
 def cut_at_encounters(view: PiecedView, doubtful: np.ndarray, radius: float) -> PiecedView:
-    """Cut some pieces wherever another dot comes near; the dots inside an encounter are in no piece afterwards.
+    """Cut some pieces wherever another dot comes near; dots inside an encounter are in no piece then.
 
     A dot that was missed for a few frames is taken to be between its neighbours.
 
     Parameters
     ----------
     view : PiecedView
+        Before.
     doubtful : (K,) bool
         Pieces to cut.
     radius : float
@@ -92,6 +93,7 @@ def cut_at(view: PiecedView, piece: np.ndarray, frame: np.ndarray) -> PiecedView
     Parameters
     ----------
     view : PiecedView
+        Before.
     piece, frame : (K,) int
         What to cut and where; a piece may appear more than once.
     """
@@ -116,7 +118,7 @@ def _renumbered(view: PiecedView, rows: np.ndarray, part: np.ndarray, left_out: 
 
 
 def _has_company(view: PiecedView, rows: np.ndarray, radius: float) -> np.ndarray:
-    """Whether a dot of another piece is within the radius of each row, or would be, had it not been missed."""
+    """Whether each row has another dot within the radius, or would have, had it not been missed."""
     frame, xy = _with_missed(view)
     tree = cKDTree(np.column_stack([frame * (4.0 * radius), xy]))
     query = np.column_stack([view.frame[rows] * (4.0 * radius), view.xy[rows]])

@@ -1,8 +1,8 @@
 """How likely is a piece of track to have a partner in another view at all? Learnt from the recording.
 
-Reflections, insects and noise make short tracks that no other view has; animals make longer ones. The share π of
-pieces with a partner is estimated for each length (1, 2–3, 4–7, 8–15 … dots) by expectation–maximisation: with S
-the log of the mean Bayes factor of a piece over the pieces it might belong to,
+Reflections, insects and noise make short tracks that no other view has; animals make longer ones. The share π
+of pieces with a partner is estimated for each length (1, 2–3, 4–7, 8–15 … dots) by expectation–maximisation:
+with S the log of the mean Bayes factor of a piece over the pieces it might belong to,
 
     P(partner) = π e^S / (1 − π + π e^S),     π ← mean of P(partner)
 

@@ -2,8 +2,8 @@
 
 Joining groups two by two may end where no single step gains but an exchange does. For one view after another,
 what each group holds in that view is taken out and given back so that the sum of the log-odds is largest
-(Jonker and Volgenant's algorithm, scipy's :func:`~scipy.optimize.linear_sum_assignment`; solved apart for every
-connected part of the sparse table). With whole tracks in two views this is the optimum itself.
+(Jonker and Volgenant's algorithm, scipy's :func:`~scipy.optimize.linear_sum_assignment`; solved apart for
+every connected part of the sparse table). With whole tracks in two views this is the optimum itself.
 """
 
 from __future__ import annotations

@@ -20,6 +20,8 @@ from acino_fte.data_tools.trajectory_motion import N_LAGS, MotionModel, Pieces, 
 
 _NEXT = 3 * N_LAGS
 
+_RIDGES = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)  # shares of the diagonal
+
 
 class ChainFactor:
     """Cholesky factor of H for all pieces.
@@ -57,10 +59,7 @@ class ChainFactor:
             band[:, axis, ::3] = self._prior.T
             for row in range(axis, 3):
                 band[:, axis, row - axis] += information[:, row, axis]
-        factor, info = dpbtrf(band.reshape(3 * n, -1).T, lower=1, overwrite_ab=1)
-        if info or not np.isfinite(factor[0]).all():
-            raise np.linalg.LinAlgError(f"the information is not positive definite at node {(info - 1) // 3}")
-        self._factor = factor
+        self._factor = _cholesky(band.reshape(3 * n, -1).T)
 
     @property
     def log_determinant(self) -> float:
@@ -135,6 +134,17 @@ class ChainFactor:
             shifted[:, 3:, :3] = cross[:, :-3]
             shifted[:, :3, 3:] = cross[:, :-3].transpose(0, 2, 1)
             window = shifted
+
+
+def _cholesky(band: np.ndarray) -> np.ndarray:
+    """Banded Cholesky factor; rounding may need a little more on the diagonal when rows contradict each other."""
+    for ridge in _RIDGES:
+        firmer = band.copy()
+        firmer[0] += ridge * np.abs(band[0])
+        factor, info = dpbtrf(firmer, lower=1, overwrite_ab=1)
+        if not info and np.isfinite(factor[0]).all():
+            return factor
+    raise np.linalg.LinAlgError(f"the information is not positive definite at node {(info - 1) // 3}")
 
 
 def _inverse_lower(matrix: np.ndarray) -> np.ndarray:
