@@ -1,4 +1,8 @@
-"""Confidence of small groupings, worked out by hand."""
+"""Confidence: of small groupings, worked out by hand; and of recordings in which some matches are wrong."""
+
+import importlib.util
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -81,3 +85,45 @@ def test_sure_matches_do_not_overflow():
     g = whole([0, 1, 1], {(0, 1): 5000.0, (0, 2): -5000.0})
     found = confidence_of(g, np.array([0, 0, 1]))
     assert found.probability[0] == 1.0
+
+
+def bench():
+    """The benchmark's module, which knows what is right and draws the curve."""
+    path = Path(__file__).resolve().parents[1] / "benchmarks" / "bench_tracks.py"
+    spec = importlib.util.spec_from_file_location("bench_tracks", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_reliability_by_hand():
+    tracks = bench()
+    told = np.array([0.55, 0.55, 0.95, 0.96, 0.9999, 1.0])
+    curve = tracks.reliability(told, np.array([True, False, True, True, True, False]))
+    np.testing.assert_array_equal(curve.count[curve.count > 0], [2, 2, 2])
+    np.testing.assert_allclose(curve.right[curve.count > 0], [0.5, 1.0, 0.5])
+    assert curve.error == pytest.approx((2 * 0.05 + 2 * 0.045 + 2 * 0.49995) / 6)
+
+
+def test_probabilities_that_are_told_come_true(tmp_path):
+    """Recordings hard enough to have errors: within 3 % on average, 5 % in every bin that matters."""
+    tracks = bench()
+    rows = []
+    for name, frames in (
+        ("40 animals, 8 px, pieces of 2–6", 40),
+        ("100 animals, clutter", 30),
+        ("flock", 100),
+        ("three views, 8 px", 30),
+        ("four views, much clutter", 40),
+        ("exchanges", 200),
+    ):
+        rows.append(tracks.collect(tracks.HARD[name] | {"n_frames": frames}, range(60, 61)))
+    told, right = (np.concatenate(x) for x in zip(*rows, strict=True))
+    assert np.count_nonzero(~right) > 50
+    curve = tracks.reliability(told, right)
+    assert curve.error <= 0.03
+    filled = curve.count >= 0.05 * len(told)
+    np.testing.assert_allclose(curve.told[filled], curve.right[filled], atol=0.05)
+    tracks.draw_reliability({"all": curve}, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").stat().st_size > 1000

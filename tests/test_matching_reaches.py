@@ -135,14 +135,14 @@ def best_views(n: int, x: np.ndarray) -> list[Camera]:
 def test_starlings_on_perches_in_fragments(sigma, seed):
     """Two cameras that see several birds in one epipolar plane."""
     cameras = [barn()[name] for name in ("2123022", "2123384")]
-    _, found = reached(filmed(cameras, places(), sigma, seed))
+    _, found = reached(filmed(cameras, places(3000), sigma, seed))
     assert found.pooled.precision >= 0.99
     assert found.pooled.recall >= 0.99
 
 
 def test_more_cameras_are_better_than_any_two_of_them():
-    """Of 1,500 frames, three and then four cameras; every pair is scored in its own two views."""
-    x = places(1500)
+    """Of 900 frames, three and then four cameras; every pair is scored in its own two views."""
+    x = places(900)
     recording = filmed(best_views(4, x), x, 5.0, 7)
     for n in (3, 4):
         views = range(n)
