@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 _GATE = 16.0
 _BEYOND = 8
 _NEVER = 1e3
+_SPAN = np.int64(1 << 40)  # more than the frames of any recording
 _SURE = 0.9
 _MOST_ROUNDS, _FEW = 12, 0.003
 
@@ -50,7 +51,7 @@ def claim_loose_dots(matches: TrackMatches, max_gap: int) -> TrackMatches:
         kept = _without_strangers(matches, paths)
         group = np.append(join_paths(paths, kept, max_gap), -1)
         claimed = _with_claims(kept, paths)
-        joined = replace(claimed, groups=tuple(group[g] for g in claimed.groups), rival=group[claimed.rival])
+        joined = _joined(kept, claimed, group)
         won = sum(int((a != b).sum()) for a, b in zip(kept.groups, claimed.groups, strict=True))
         same = all(np.array_equal(a, b) for a, b in zip(matches.groups, joined.groups, strict=True))
         matches = joined
@@ -58,6 +59,26 @@ def claim_loose_dots(matches: TrackMatches, max_gap: int) -> TrackMatches:
             break
     paths = _without_extension(paths) if same else _paths(matches, max_gap, motion=paths.motion)
     return replace(matches, trajectories=paths)
+
+
+def _joined(before: TrackMatches, claimed: TrackMatches, group: np.ndarray) -> TrackMatches:
+    """Groups under their new numbers; a claim yields to a dot that the joined group has there already."""
+    groups, sure = [], []
+    for k, view in enumerate(claimed.recording.views):
+        old, new = group[before.groups[k]], group[claimed.groups[k]]
+        won = np.flatnonzero((old < 0) & (new >= 0))
+        held = new[old >= 0] * _SPAN + view.frame[old >= 0]
+        key = new[won] * _SPAN + view.frame[won]
+        order = np.argsort(-claimed.confidence[k][won], kind="stable")
+        twice = np.ones(len(won), dtype=bool)
+        twice[order[np.unique(key[order], return_index=True)[1]]] = False
+        yields = won[twice | np.isin(key, held)]
+        new[yields] = -1
+        groups.append(new)
+        confidence = claimed.confidence[k].copy()
+        confidence[yields] = np.nan
+        sure.append(confidence)
+    return replace(claimed, groups=tuple(groups), confidence=tuple(sure), rival=group[claimed.rival])
 
 
 def _paths(
@@ -121,9 +142,9 @@ def _claims(matches: TrackMatches, paths: Trajectories, k: int) -> tuple[np.ndar
     """Loose rows of view k, the path that each goes to and the probability."""
     view, group, camera = matches.recording.views[k], matches.groups[k], matches.recording.cameras[k]
     loose = np.flatnonzero(group < 0)
-    taken = np.unique(group[group >= 0] * np.int64(1 << 40) + view.frame[group >= 0])
+    taken = np.unique(group[group >= 0] * _SPAN + view.frame[group >= 0])
     point = np.arange(len(paths))
-    free = ~np.isin(paths.group * np.int64(1 << 40) + paths.frame, taken)
+    free = ~np.isin(paths.group * _SPAN + paths.frame, taken)
     point = point[free]
     row, at = _same_frame(view.frame[loose], paths.frame[point])
     row, at = loose[row], point[at]

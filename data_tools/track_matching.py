@@ -35,6 +35,7 @@ from acino_fte.data_tools.dot_linking import link_dots
 from acino_fte.data_tools.epipolar_angles import PlaneAngles, plane_angles, rays_of
 from acino_fte.data_tools.match_confidence import Confidence, confidence_of
 from acino_fte.data_tools.match_noise import first_noise, matched_noise
+from acino_fte.data_tools.match_options import MatchOptions
 from acino_fte.data_tools.track_changes import find_changes
 from acino_fte.data_tools.track_claims import claim_loose_dots
 from acino_fte.data_tools.track_dots import Dots, Noise
@@ -57,34 +58,6 @@ _MOST_CUTS, _MOST_NOISE = 4, 4
 _LONG, _FAR_SHARE, _FAR_FRAMES = 10, 0.05, 1.0
 
 Progress = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class MatchOptions:
-    """How to match.
-
-    Attributes
-    ----------
-    noise_px : float, optional
-        Standard deviation of a dot's coordinate, px; estimated when not given.
-    max_gap_s : float
-        Longest gap within a view across which a piece of track is continued, s.
-    encounter : float
-        Dots of one view closer than this, in standard deviations of the noise, may have been exchanged.
-    tracks : bool
-        Whether the tracker's tracks are used; if not, all dots are taken as bare points.
-    follow : bool
-        Whether 3D paths drop dots that do not belong to them and claim loose ones.
-    min_confidence : float
-        Matches less probable than this are left out.
-    """
-
-    noise_px: float | None = None
-    max_gap_s: float = 1.0
-    encounter: float = 4.0
-    tracks: bool = True
-    follow: bool = True
-    min_confidence: float = 0.5
 
 
 @dataclass(frozen=True, eq=False)

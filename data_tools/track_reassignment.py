@@ -70,9 +70,10 @@ def _reassign_view(graph: PieceGraph, label: np.ndarray, view: int) -> np.ndarra
         if better <= 1e-6:
             continue
         improvement += better
-        target[parts] = fresh + np.arange(len(parts))
-        fresh += len(parts)
         kept = value > 0
+        leaving = np.union1d(parts, rests[columns[kept]])  # also what no evidence holds where another comes
+        target[leaving] = fresh + np.arange(len(leaving))
+        fresh += len(leaving)
         target[parts[rows[kept]]] = rests[columns[kept]]
     if improvement <= 0:
         return None
