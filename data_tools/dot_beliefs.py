@@ -1,9 +1,9 @@
 """How probable is every link, given all others? Belief propagation over the graph of possible links.
 
-A dot has at most one link that comes in and one that goes out, and what it says of the two together is a density:
-where an animal that came this way goes next. Sums over the alternatives pass along the links, forwards and
-backwards, as in the data association of Williams & Lau (2014, "Approximate evaluation of marginal association
-probabilities with belief propagation", equations 27–30), here with a factor that couples both sides of a dot.
+A dot has at most one link that comes in and one that goes out, and what it says of the two together is a
+density: where an animal that came this way goes next. Sums over the alternatives pass along the links,
+forwards and backwards, as in the data association of Williams & Lau (2014, "Approximate evaluation of marginal
+association probabilities with belief propagation"), here with a factor that couples both sides of a dot.
 Exact where the graph has no loop. Shapes: P dots, E links, T pairs of links that follow one another.
 """
 
@@ -74,9 +74,9 @@ def first_messages(links: Links, weights: Weights) -> Messages:
 def propagate(links: Links, weights: Weights, messages: Messages) -> Messages:
     """The messages after one exchange.
 
-    Around the smallest loop, two animals that may have changed places, plain belief propagation counts the same
-    evidence over and over and is sure of either. Here rivals are weighed with what they would be worth were the
-    dot that they contest free, and the exchange of two is exact.
+    Around the smallest loop, two animals that may have changed places, plain belief propagation counts the
+    same evidence over and over and is sure of either. Here rivals are weighed with what they would be worth
+    were the dot that they contest free, and the exchange of two is exact.
     """
     n_dots, n_links = len(weights.birth), len(links)
     source, target = links.source, links.target
@@ -103,8 +103,7 @@ def propagate(links: Links, weights: Weights, messages: Messages) -> Messages:
         rivals = np.maximum(sums(target, taken, n_dots)[target] - taken, 0.0)
         return goes_on / (alone[target] + rivals)
 
-    earlier = forward(goes_on / alone[target])
-    later = backward(earlier)
-    odds = earlier * later
+    later = backward(forward(goes_on / alone[target]))
+    odds = forward(later) * later
     onward = forward(backward(on / (weights.end * coming)[source]))
     return Messages(onward, later, odds / (1.0 + odds))

@@ -1,8 +1,8 @@
-"""Which dots of later frames may be a dot's next: the pairs worth a look, and how far animals move in a frame.
+"""Which dots of later frames may be a dot's next, and how far animals move in a frame.
 
-How far they move needs no link: around a dot, the next frame has one dot more than its own frame has (the dot
-itself, a frame later). The number of pairs of dots of consecutive frames within a distance, less that of pairs of
-one frame, is therefore the distribution of the displacements, however dense the dots are.
+How far they move needs no link: around a dot, the next frame has one dot more than its own frame has (the
+dot itself, a frame later). The number of pairs of dots of consecutive frames within a distance, less that of
+pairs of one frame, is therefore the distribution of the displacements, however dense the dots are.
 Shapes: P dots of one view sorted by frame, E links.
 """
 
@@ -14,8 +14,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 _MOST_PAIRS = 10_000_000
-_MOST_TRIPLES, _FEWEST, _MOST = 4_000_000, 3, 8
+_MOST_TRIPLES, _FEWEST, _MOST = 600_000, 3, 6
 _NEIGHBOURS = 6
+_REACH = 2.0  # of what nearly all links have
 _SURE = 4.0  # standard errors
 
 
@@ -63,10 +64,13 @@ class Displacements:
         px.
     share : (B,)
         Share of the dots that have a next dot within the radius; at most one.
+    found : float
+        Share of the dots that are seen in the next frame again.
     """
 
     radius: np.ndarray
     share: np.ndarray
+    found: float
 
     def quantile(self, q: float) -> float:
         """Radius within which the share q of those that have a next dot have it, px."""
@@ -105,9 +109,11 @@ def measure_displacements(frame: np.ndarray, xy: np.ndarray) -> Displacements | 
     sure = np.flatnonzero(excess > np.maximum(_SURE * error, 0.02))
     if not len(sure):
         return None
-    top = min(1.0, float((excess - error)[sure].max()))
+    top = min(1.0, float((excess - 3.0 * error)[sure].max()))
     share = np.clip(np.maximum.accumulate(excess), 0.0, top)
-    return Displacements(radius, share)
+    furthest = _REACH * radius[np.argmax(share >= 0.97 * top)]
+    found = float(np.clip(excess[np.searchsorted(radius, furthest).clip(max=len(radius) - 1)], top, 1.0))
+    return Displacements(radius, share, found)
 
 
 def _histogram(here: np.ndarray, there: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -139,10 +145,11 @@ def find_candidates(frame: np.ndarray, xy: np.ndarray, moved: Displacements, max
     xy : (P, 2)
         px.
     moved : Displacements
+        How far dots move.
     max_gap : int
         Longest gap, frames from dot to dot.
     """
-    reach = 1.4 * moved.quantile(0.97)
+    reach = _REACH * moved.quantile(0.97)
     apart = 4.0 * reach * max_gap
     tree = cKDTree(np.column_stack([frame * apart, xy]))
     source, target, gaps = [], [], []

@@ -1,8 +1,9 @@
 """Bare dots of one view joined to short, pure pieces of track.
 
-A link is made only where it is unambiguous: its probability given all other possible links (:mod:`dot_beliefs`)
-is near one. How animals move is learnt from the view itself (:mod:`dot_motion`), and so is how often dots are
-missed, appear and vanish. What stays open is for other views to settle (:mod:`track_matching`).
+A link is made only where it is unambiguous: its probability given all other possible links
+(:mod:`dot_beliefs`) is near one. How animals move is learnt from the view itself (:mod:`dot_motion`), and how
+often dots come again from the pairs of dots (:mod:`dot_candidates`). What stays open is for other views to
+settle (:mod:`track_matching`).
 Shapes: P dots, E links, T pairs of links that follow one another, M modes of motion.
 """
 
@@ -39,7 +40,9 @@ _UNLIKELY = 1e-4
 _DROPS = (2, 4)
 _ROUNDS, _EXCHANGES = 4, 4
 _LAST_EXCHANGES = 8
-_LEARN_FROM = 8_000  # dots
+_LEARN_FROM = 6_000  # dots
+_BLOCK, _MARGIN = 25_000, 6  # dots, frames
+_HOPELESS = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +67,7 @@ class DotModel:
 
 
 def link_dots(
-    frame: np.ndarray, xy: np.ndarray, noise_px: float | None = None, max_gap: int = 3, sure: float = SURE
+    frame: np.ndarray, xy: np.ndarray, noise_px: float | None = None, max_gap: int = 2, sure: float = SURE
 ) -> np.ndarray:
     """Pieces of track from the dots of one view.
 
@@ -93,6 +96,8 @@ def link_dots(
     if moved is None:
         return piece
     model = _learn(frame, xy, moved, noise_px, max_gap)
+    if model is None:
+        return piece
     links, probability = _beliefs(frame, xy, moved, model, max_gap)
     piece[order] = _pieces(links, probability, len(frame), sure)
     return piece
@@ -100,10 +105,13 @@ def link_dots(
 
 def _learn(
     frame: np.ndarray, xy: np.ndarray, moved: Displacements, noise: float | None, max_gap: int
-) -> DotModel:
-    """The model by expectation and maximisation, on a stretch of the recording when it is long."""
+) -> DotModel | None:
+    """The model by expectation and maximisation, on a stretch of the recording when it is long.
+
+    None when hardly a link there can be told from its rivals.
+    """
     slow, fast = moved.quantile(0.25) / 0.76, moved.quantile(0.9) / 2.15
-    found = float(moved.share[-1])
+    found = moved.found
     missed = np.clip((1 - found) / 2, 0.005, 0.3)
     seen = missed ** np.arange(max_gap)
     model = DotModel(
@@ -114,7 +122,8 @@ def _learn(
     for _ in range(_ROUNDS):
         work.believe(model, _EXCHANGES)
         model = work.learn(model, noise)
-    return model
+    likely = work.messages.probability > 0.5
+    return model if likely.sum() > _HOPELESS * len(work.frame) else None
 
 
 def _stretch(frame: np.ndarray, most: int) -> slice:
@@ -123,15 +132,30 @@ def _stretch(frame: np.ndarray, most: int) -> slice:
         return slice(None)
     low = (len(frame) - most) // 2
     low, high = frame[low], frame[low + most]
-    return slice(np.searchsorted(frame, low), np.searchsorted(frame, max(high, low + 20)))
+    return slice(np.searchsorted(frame, low), np.searchsorted(frame, max(high, low + 8)))
 
 
 def _beliefs(
     frame: np.ndarray, xy: np.ndarray, moved: Displacements, model: DotModel, max_gap: int
 ) -> tuple[Links, np.ndarray]:
-    work = _Linking(frame, xy, moved, max_gap)
-    work.believe(model, _LAST_EXCHANGES)
-    return work.links, work.messages.probability
+    """Links and their probability, block by block: a belief depends on a few frames around it."""
+    frames, start = np.unique(frame, return_index=True)
+    start = np.r_[start, len(frame)]
+    found: list[tuple[np.ndarray, ...]] = []
+    low = 0
+    while low < len(frames):
+        high = int(np.searchsorted(start, start[low] + _BLOCK, side="right")) - 1
+        high = min(max(high, low + 1), len(frames))
+        rows = slice(start[max(low - _MARGIN, 0)], start[min(high + _MARGIN, len(frames))])
+        work = _Linking(frame[rows], xy[rows], moved, max_gap)
+        work.believe(model, _LAST_EXCHANGES)
+        source = work.links.source + rows.start
+        mine = (source >= start[low]) & (source < start[high])
+        links = source, work.links.target + rows.start, work.links.gap, work.messages.probability
+        found.append(tuple(part[mine] for part in links))
+        low = high
+    source, target, gap, probability = (np.concatenate(part) for part in zip(*found, strict=True))
+    return Links(source, target, gap, np.zeros(len(frame))), probability
 
 
 class _Linking:
@@ -194,10 +218,19 @@ class _Linking:
         value = np.empty(len(first))
         gaps = self.links.gap[second]
         for gap in range(1, self.max_gap + 1):
-            states = step(states, model.motion)
             of = np.flatnonzero(gaps == gap)
+            if gap == 1:
+                states = step(states, model.motion)
+                which = first[of]
+            elif len(of):
+                used, which = np.unique(first[of], return_inverse=True)
+                states_then = states[used]
+                for _ in range(gap - 1):
+                    states_then = step(states_then, model.motion)
             xy = self.xy[self.links.target[second[of]]]
-            value[of] = model.seen[gap - 1] * density_at(states, first[of], xy, model.motion)
+            if len(of):
+                after = states if gap == 1 else states_then
+                value[of] = model.seen[gap - 1] * density_at(after, which, xy, model.motion)
         return value
 
     def _weights(
@@ -211,14 +244,17 @@ class _Linking:
     ) -> tuple[States, np.ndarray]:
         """State at the target of every link, after the likeliest link that comes to its source."""
         links = self.links
-        predicted = begun(self.xy[links.source], model.motion)
-        if before is not None:
+        if before is None:
+            predicted = begun(self.xy[links.source], model.motion)
+        else:
             previous = best_link(links.target, probability, len(self.frame))[links.source]
-            known = previous >= 0
-            predicted = _chosen(known, before[np.maximum(previous, 0)], predicted)
-        for gap in range(1, self.max_gap + 1):
-            moved = step(predicted, model.motion)
-            predicted = _chosen(links.gap >= gap, moved, predicted) if gap > 1 else moved
+            predicted = before[np.maximum(previous, 0)]
+            unknown = np.flatnonzero(previous < 0)
+            predicted.put(unknown, begun(self.xy[links.source[unknown]], model.motion))
+        predicted = step(predicted, model.motion)
+        for gap in range(2, self.max_gap + 1):
+            of = np.flatnonzero(links.gap >= gap)
+            predicted.put(of, step(predicted[of], model.motion))
         return updated(predicted, self.xy[links.target], model.motion)
 
     def learn(self, model: DotModel, noise: float | None) -> DotModel:
@@ -237,15 +273,8 @@ class _Linking:
         return replace(model, motion=motion)
 
 
-def _chosen(mask: np.ndarray, yes: States, no: States) -> States:
-    def choose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-
-    return States(*(choose(getattr(yes, n), getattr(no, n)) for n in States.__dataclass_fields__))
-
-
 def best_link(dot: np.ndarray, probability: np.ndarray, n_dots: int) -> np.ndarray:
-    """The likeliest link of each dot (P,), given the dot (E,) of every link; −1 when none is the likelier case."""
+    """The likeliest link of each dot (P,), given the dot (E,) of every link; −1 when none is likelier."""
     order = np.argsort(probability, kind="stable")
     best = np.full(n_dots, -1)
     best[dot[order]] = order

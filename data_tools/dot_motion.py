@@ -1,10 +1,10 @@
-"""How a dot moves in the image: a mixture of modes, each a velocity that fades and a jitter, learnt from the dots.
+"""How a dot moves in the image: in modes, each a velocity that fades and a jitter, learnt from the dots.
 
-In mode m the displacement of a frame is v' = ρ v + N(0, s²(1 − ρ²)) on each axis and the dot is where it is with a
-jitter of variance R (noise of the detector included). A bird on a perch has a small s, one in flight a large one.
-The place of the next dot is predicted by a Kalman filter for each mode; the odds of the modes follow from how well
-each predicted so far (a multiple-model filter; Bar-Shalom, Li & Kirubarajan 2001, section 11.6). A mode whose
-prediction fails badly begins anew at the dot. Shapes: E states, M modes, G gaps.
+In mode m the displacement of a frame is v' = ρ v + N(0, s²(1 − ρ²)) on each axis, and the dot is seen with
+a jitter of variance R (noise of the detector included). A bird on a perch has a small s, one in flight a large
+one. The place of the next dot is predicted by a Kalman filter for each mode; the odds of the modes follow
+from how well each predicted so far (a multiple-model filter; Bar-Shalom, Li & Kirubarajan 2001, section 11.6).
+A mode whose prediction fails badly begins anew at the dot. Shapes: E states, M modes, G gaps.
 """
 
 from __future__ import annotations
@@ -67,6 +67,11 @@ class States:
 
     def __getitem__(self, which: np.ndarray) -> States:
         return States(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def put(self, which: np.ndarray, other: States) -> None:
+        """Write other states in the places `which`."""
+        for f in fields(self):
+            getattr(self, f.name)[which] = getattr(other, f.name)
 
 
 def begun(xy: np.ndarray, motion: Motion) -> States:
@@ -136,20 +141,12 @@ def updated(states: States, xy: np.ndarray, motion: Motion) -> tuple[States, np.
         states.vv - gain_v * states.pv,
         odds,
     )
-    lost = squared > _LOST
-    if not lost.any():
-        return new, squared
-    fresh = begun(xy, motion)
-    mixed = {
-        f.name: np.where(
-            lost if getattr(new, f.name).ndim == 2 else lost[..., None],
-            getattr(fresh, f.name),
-            getattr(new, f.name),
-        )
-        for f in fields(States)
-        if f.name != "odds"
-    }
-    return States(**mixed, odds=odds), squared
+    row, mode = np.nonzero(squared > _LOST)
+    if len(row):
+        new.place[row, mode], new.velocity[row, mode] = xy[row], 0.0
+        new.pp[row, mode], new.pv[row, mode] = motion.jitter2[mode], 0.0
+        new.vv[row, mode] = motion.speed2[mode]
+    return new, squared
 
 
 def first_motion(slow: float, fast: float, noise: float | None) -> Motion:
@@ -172,12 +169,13 @@ def learn_motion(
 ) -> Motion:
     """The modes that fit links best.
 
-    With the covariances c₀, c₁, c₂ of displacements no, one and two frames apart: c₀ = s² + 2R, c₁ = ρ s² − R,
-    c₂ = ρ² s². So R² + 2 (c₁ + c₂) R + c₁² − c₀ c₂ = 0.
+    With the covariances c₀, c₁, c₂ of displacements no, one and two frames apart: c₀ = s² + 2R,
+    c₁ = ρ s² − R, c₂ = ρ² s². So R² + 2 (c₁ + c₂) R + c₁² − c₀ c₂ = 0.
 
     Parameters
     ----------
     before : Motion
+        The motion so far.
     moved : (E, 2)
         Displacement of every link, px/frame.
     chain : (H, 3) int
@@ -209,8 +207,8 @@ def learn_motion(
     jitter = -(c1 + c2) + np.sqrt(np.maximum((c1 + c2) ** 2 - c1**2 + c0 * np.maximum(c2, 0), 0))
     jitter = np.clip(jitter, np.maximum(least, 0.01 * c0), np.maximum(c0 / 2, least))
     speed = np.maximum(c0 - 2 * jitter, 0.001 * c0 + _LEAST)
-    rho = np.clip((c1 + jitter) / speed, 0.0, 0.98)
-    enough = heavy > 20
+    rho = np.clip((c1 + jitter) / speed, 0.0, 0.995)
+    enough = heavy > 8
     return replace(
         new,
         speed2=np.where(enough, speed, before.speed2),
