@@ -25,10 +25,11 @@ _PANELS = 6
 _SIGMAS = 6.0
 _MAD = 1.4826
 _WITHIN = 3.0  # standard deviations: what a right pair keeps to
-_PAIRS = 100_000  # of dots looked at for the matrix
+_PAIRS = 400_000  # of dots looked at for the matrix
 _LEAST_FRAMES, _LEAST_DOTS = 3, 10
 _MOST_UNMATCHED = 200
 _MOST_PIECES = 250  # with more, all pieces of an animal are one row
+_MOST_ANIMALS = 150  # of more, some are shown
 
 
 def residual_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
@@ -116,7 +117,7 @@ def matrix_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
     whole = max(map(len, units)) > _MOST_PIECES
     if whole:
         matches = replace(matches, pieces=tuple(np.where(g >= 0, g, -1) for g in matches.groups))
-        units = [_units(matches, k) for k in pair]
+        units = [_some(_units(matches, k), matches.n_groups) for k in pair]
     share = _agreement(matches, pair, units)
     figure = new_track_figure(matches, title, 7.2, 7.0, 0.85)
     figure.text(
@@ -137,14 +138,21 @@ def matrix_figure(matches: TrackMatches, points: SpacePoints) -> Figure:
         _frames(axes, units, share)
     names = matches.recording.cameras.names
     kind = "animal, as seen" if whole else "piece of track"
-    axes.set_xlabel(f"{kind} in {names[pair[1]]}, {share.shape[1]} of them")
-    axes.set_ylabel(f"{kind} in {names[pair[0]]}, {share.shape[0]} of them")
+    of = f"of {matches.n_groups}" if whole else "of them"
+    axes.set_xlabel(f"{kind} in {names[pair[1]]}, {share.shape[1]} {of}")
+    axes.set_ylabel(f"{kind} in {names[pair[0]]}, {share.shape[0]} {of}")
     for unit, axis in ((units[0], axes.yaxis), (units[1], axes.xaxis)):
         _ticks(axis, unit[:, 1])
     bar = figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02)
     bar.set_label(f"share of common frames within {_WITHIN:g} standard deviations")
     bar.outline.set_visible(False)
     return figure
+
+
+def _some(units: np.ndarray, n_groups: int) -> np.ndarray:
+    """Of very many animals an even choice."""
+    every = -(-n_groups // _MOST_ANIMALS)
+    return units[(units[:, 1] >= 0) & (units[:, 1] % every == 0)]
 
 
 def _units(matches: TrackMatches, k: int) -> np.ndarray:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _MOST_DOTS, _MOST_PATH = 8_000, 25_000  # drawn in a view: dots of every n-th frame; points of paths, or none
 _UNMATCHED = "#A8A8A8"
+_TONES = 40
 _CUT = 0.5  # the image is cut out around the dots when they fill less than this of its sides
 
 
@@ -98,12 +99,12 @@ def _panel(axes: Axes, matches: TrackMatches, points: SpacePoints, k: int, colou
     every = _every(matches)
     some = view.frame % every == 0 if every > 1 else np.ones(len(view), dtype=bool)
     size = float(np.clip(3.2 - 1.1 * math.log10(max(some.sum(), 1) / 500), 1.0, 3.2))
-    for chosen, shade, z in (((group < 0) & some, _UNMATCHED, 1), ((group >= 0) & some, None, 2)):
-        if chosen.any():
-            for g in np.unique(group[chosen]):
-                mine = chosen & (group == g) if g >= 0 else chosen
-                colour = shade if shade is not None else colours[g]
-                axes.plot(*view.xy[mine].T, ".", color=colour, ms=size, mew=0, zorder=z)
+    shade = np.round(_TONES * colours).astype(int) @ [1, 1000, 1000**2]  # many animals share a few tones
+    tones = np.where(group >= 0, shade[group] if len(shade) else -1, -1)
+    for tone in np.unique(tones[some]):
+        mine = some & (tones == tone)
+        colour = colours[group[mine][0]] if tone >= 0 else _UNMATCHED
+        axes.plot(*view.xy[mine].T, ".", color=colour, ms=size, mew=0, zorder=2 if tone >= 0 else 1)
     pixels = predicted_pixels(matches, points, k)
     if len(points) <= _MOST_PATH:
         lines, shades = _paths(points, pixels, colours)
