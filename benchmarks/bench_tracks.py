@@ -84,13 +84,13 @@ def measure(name: str, follow: bool, thesis: bool) -> dict[str, Any]:
     options = TrackSimulation(**{"seed": 900} | (CASES | LARGE)[name])
     recording = simulate_tracks(options)
     marks: list[tuple[str, float]] = []
-    began = time.perf_counter()
+    began, cpu = time.perf_counter(), time.process_time()
     matches = match_tracks(
         recording,
         MatchOptions(follow=follow),
         progress=lambda step: marks.append((step, time.perf_counter())),
     )
-    ended = time.perf_counter()
+    ended, cpu = time.perf_counter(), time.process_time() - cpu
     times = [began, *(when for _, when in marks[1:]), ended]
     steps: dict[str, float] = {}
     for (step, _), first, last in zip(marks, times[:-1], times[1:], strict=True):
@@ -101,6 +101,7 @@ def measure(name: str, follow: bool, thesis: bool) -> dict[str, Any]:
         "follow": follow,
         "frames": options.n_frames,
         "seconds": ended - began,
+        "cpu_seconds": cpu,
         "steps": steps,
         "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
         "precision": found.precision,
@@ -131,9 +132,8 @@ def fastest(name: str, follow: bool, runs: int, thesis: bool = False) -> dict[st
 def report(one: dict[str, Any]) -> str:
     """A line and the steps of a case."""
     name, seconds = one["case"], one["seconds"]
-    line = (
-        f"{name + ('' if one['follow'] else ', no 3D paths'):36s} {seconds:8.2f} s {one['peak_gb']:5.2f} GB"
-    )
+    line = f"{name + ('' if one['follow'] else ', no 3D paths'):36s} {seconds:8.2f} s"
+    line += f" {one['cpu_seconds']:8.2f} s CPU {one['peak_gb']:5.2f} GB"
     line += f" {1000 * seconds / one['frames']:8.3f} ms/frame  {one['precision']:.4f} / {one['recall']:.4f}"
     if name in AIMS:
         line += f"  (aim: {AIMS[name][0]:g} s" + (f", {AIMS[name][1]:g} GB)" if AIMS[name][1] < 99 else ")")

@@ -130,8 +130,7 @@ def best_views(n: int, x: np.ndarray) -> list[Camera]:
     return [cameras[name] for name in sorted(share, key=lambda name: (-share[name], name))[:n]]
 
 
-@pytest.mark.parametrize("sigma", [1.0, 3.0])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("sigma", "seed"), [(1.0, 0), (3.0, 1)])
 def test_starlings_on_perches_in_fragments(sigma, seed):
     """Two cameras that see several birds in one epipolar plane."""
     cameras = [barn()[name] for name in ("2123022", "2123384")]
