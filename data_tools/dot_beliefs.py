@@ -2,8 +2,9 @@
 
 A dot has at most one link that comes in and one that goes out, and what it says of the two together is a
 density: where an animal that came this way goes next. Sums over the alternatives pass along the links,
-forwards and backwards, as in the data association of Williams & Lau (2014, "Approximate evaluation of marginal
-association probabilities with belief propagation"), here with a factor that couples both sides of a dot.
+forwards and backwards, as in the data association of Williams & Lau (2014, "Approximate evaluation of
+marginal association probabilities with belief propagation"), here with a factor that couples both sides
+of a dot.
 Exact where the graph has no loop. Shapes: P dots, E links, T pairs of links that follow one another.
 """
 

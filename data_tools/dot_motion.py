@@ -1,10 +1,11 @@
 """How a dot moves in the image: in modes, each a velocity that fades and a jitter, learnt from the dots.
 
-In mode m the displacement of a frame is v' = ρ v + N(0, s²(1 − ρ²)) on each axis, and the dot is seen with
-a jitter of variance R (noise of the detector included). A bird on a perch has a small s, one in flight a large
-one. The place of the next dot is predicted by a Kalman filter for each mode; the odds of the modes follow
-from how well each predicted so far (a multiple-model filter; Bar-Shalom, Li & Kirubarajan 2001, section 11.6).
-A mode whose prediction fails badly begins anew at the dot. Shapes: E states, M modes, G gaps.
+In mode m the displacement of a frame is v' = ρ v + N(0, s²(1 − ρ²)) on each axis, and the dot is seen
+with jitter of variance R (noise of the detector included). A bird on a perch has a small s, one in flight
+a large one. The place of the next dot is predicted by a Kalman filter for each mode; the odds of the
+modes follow from how well each predicted so far (a multiple-model filter; Bar-Shalom, Li & Kirubarajan
+2001, section 11.6). A mode whose prediction fails badly begins anew at the dot.
+Shapes: E states, M modes, G gaps.
 """
 
 from __future__ import annotations
