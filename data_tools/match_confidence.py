@@ -78,7 +78,10 @@ def _gains(graph: PieceGraph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray
     group = label[np.concatenate([graph.v, graph.u])]
     weight = np.concatenate([graph.weight, graph.weight])
     key, inverse = np.unique(piece * np.int64(n) + group, return_inverse=True)
-    return key // n, key % n, np.bincount(inverse, weights=weight, minlength=len(key))
+    links = np.tile(graph.view[graph.u] == graph.view[graph.v], 2)
+    linked = np.bincount(inverse, weights=links, minlength=len(key)) > 0
+    total = np.bincount(inverse, weights=weight, minlength=len(key))
+    return key // n, key % n, np.where(linked, total, total - graph.price)
 
 
 def _displaced(

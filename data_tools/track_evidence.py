@@ -10,12 +10,11 @@ dot that is not the same spot of the body in both views), the log of the Bayes f
 
     log N(d̄; 0, v) − log p(d̄ | others) = chance + ½ log((σ² + σ_s²)/v) − ½ d̄²/v,     v = σ²/n_b + σ_s²
 
-where chance = −log(√(2π) √(σ² + σ_s²) · density of another animal's dots along d). The sum over the looks,
-less log m for the m animals in view of which any might have been the one, is the weight W. The sum of d̄²/v
-is taken over blocks no longer than a look (frames, chunks of 64 frames, or all), which has the same mean,
-with as much added as the additional blocks take away; scatter inside a block counts only where it is clearly
-too large. A frame in which the dots are beyond reach costs ½ reach²; one in fifty is free, for the dots of
-real detectors that are somewhere else.
+where chance = −log(√(2π) √(σ² + σ_s²) · density of another animal's dots along d). The sum over the looks is
+the weight W. The sum of d̄²/v is taken over blocks no longer than a look (frames, chunks of 64 frames, or
+all), which has the same mean, with as much added as the additional blocks take away; scatter inside a block
+counts only where it is clearly too large. A frame in which the dots are beyond reach costs ½ reach²; one in
+fifty is free, for the dots of real detectors that are somewhere else.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class Evidence:
     chunks : (E,)
         Number of chunks.
     weight : (E,)
-        W, log-odds (natural).
+        W, log Bayes factor (natural).
     """
 
     a: np.ndarray
@@ -259,9 +258,8 @@ def _weights(a: Dots, b: Dots, noise: Noise, e: Evidence) -> np.ndarray:
         whole - 1.0 + np.maximum(fine, coarse),
     )
     per_look = chance + 0.5 * np.log(noise.total**2 / spread) - 0.5
-    others = np.log(0.5 * (animals_in_view(a) + animals_in_view(b)))
     far = np.maximum(e.shared - e.near - _STRAY * e.shared, 0.0)
-    return looks * per_look - 0.5 * misfit - 0.5 * REACH**2 * far - others
+    return looks * per_look - 0.5 * misfit - 0.5 * REACH**2 * far
 
 
 def _clearly_too_large(excess: np.ndarray, freedom: np.ndarray) -> np.ndarray:

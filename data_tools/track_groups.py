@@ -35,7 +35,10 @@ class PieceGraph:
     u, v : (E,) int
         Pieces that an edge joins; each pair at most once.
     weight : (E,)
-        Log-odds of being one animal.
+        Log Bayes factor of being one animal, of pieces of different views; log-odds, of pieces of one view.
+    price : float
+        Log of the number of animals in view, any of which might have been the one: two groups that nothing
+        links within a view pay it when they are joined.
     """
 
     view: np.ndarray
@@ -44,19 +47,29 @@ class PieceGraph:
     u: np.ndarray
     v: np.ndarray
     weight: np.ndarray
+    price: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Edges between groups: ends, summed log-odds, and frames of overlap that the sums account for."""
+    """Edges between groups.
+
+    Ends, summed weights, frames of overlap that the sums account for, and number of links within a view.
+    """
 
     u: np.ndarray
     v: np.ndarray
     weight: np.ndarray
     seen: np.ndarray
+    links: np.ndarray
+
+    @classmethod
+    def of(cls, graph: PieceGraph) -> _Edges:
+        links = (graph.view[graph.u] == graph.view[graph.v]).astype(float)
+        return cls(graph.u, graph.v, graph.weight, _overlap(graph, graph.u, graph.v), links)
 
     def take(self, which: np.ndarray) -> _Edges:
-        return _Edges(self.u[which], self.v[which], self.weight[which], self.seen[which])
+        return _Edges(self.u[which], self.v[which], self.weight[which], self.seen[which], self.links[which])
 
 
 def group_pieces(graph: PieceGraph, least: float = 0.0) -> np.ndarray:
@@ -73,11 +86,11 @@ def group_pieces(graph: PieceGraph, least: float = 0.0) -> np.ndarray:
     if not len(graph.u):
         return label
     occupied = _occupancy(graph)
-    edges = _Edges(graph.u, graph.v, graph.weight, _overlap(graph, graph.u, graph.v))
+    edges = _Edges.of(graph)
     for margin in (*(m for m in _MARGINS if m > least), least):
         while True:
             edges = _contract(edges, label)
-            total, compatible = _totals(edges, occupied)
+            total, compatible = _totals(edges, occupied, graph.price)
             edges, total = edges.take(compatible), total[compatible]
             pairs = _surest(edges, total, occupied, margin)
             if not len(pairs):
@@ -110,8 +123,8 @@ def total_log_odds(graph: PieceGraph, label: np.ndarray) -> tuple[np.ndarray, np
     names, dense = np.unique(label, return_inverse=True)
     occupied = np.zeros((len(names), *_shape(graph)), dtype=np.uint8)
     np.bitwise_or.at(occupied, dense, _occupancy(graph))
-    edges = _contract(_Edges(graph.u, graph.v, graph.weight, _overlap(graph, graph.u, graph.v)), dense)
-    total, compatible = _totals(edges, occupied)
+    edges = _contract(_Edges.of(graph), dense)
+    total, compatible = _totals(edges, occupied, graph.price)
     return names[edges.u[compatible]], names[edges.v[compatible]], total[compatible]
 
 
@@ -149,15 +162,16 @@ def _contract(edges: _Edges, label: np.ndarray) -> _Edges:
     if not len(key):
         return edges.take(np.zeros(0, dtype=int))
     heads = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
-    weight = np.add.reduceat(edges.weight[other][order], heads)
-    seen = np.add.reduceat(edges.seen[other][order], heads)
-    return _Edges(key[heads] // len(label), key[heads] % len(label), weight, seen)
+    weight, seen, links = (
+        np.add.reduceat(values[other][order], heads) for values in (edges.weight, edges.seen, edges.links)
+    )
+    return _Edges(key[heads] // len(label), key[heads] % len(label), weight, seen, links)
 
 
 _ONES = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
 
 
-def _totals(edges: _Edges, occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _totals(edges: _Edges, occupied: np.ndarray, price: float) -> tuple[np.ndarray, np.ndarray]:
     """Log-odds of each pair of groups, overlaps without an edge included; whether it can be one animal."""
     views = range(occupied.shape[1])
     overlap = np.zeros(len(edges.u))
@@ -171,7 +185,8 @@ def _totals(edges: _Edges, occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray
             for b in views:
                 if a != b:
                     overlap[part] += _ONES[one[:, a] & two[:, b]].sum(1, dtype=np.int64)
-    return edges.weight + ABSENT * np.maximum(overlap - edges.seen, 0.0), compatible
+    total = edges.weight + ABSENT * np.maximum(overlap - edges.seen, 0.0)
+    return np.where(edges.links > 0, total, total - price), compatible
 
 
 def _surest(edges: _Edges, total: np.ndarray, occupied: np.ndarray, least: float) -> np.ndarray:

@@ -39,7 +39,7 @@ from acino_fte.data_tools.match_options import MatchOptions
 from acino_fte.data_tools.track_changes import find_changes
 from acino_fte.data_tools.track_claims import claim_loose_dots
 from acino_fte.data_tools.track_dots import Dots, Noise
-from acino_fte.data_tools.track_evidence import Evidence, gather_evidence
+from acino_fte.data_tools.track_evidence import Evidence, animals_in_view, gather_evidence
 from acino_fte.data_tools.track_groups import PieceGraph, group_pieces
 from acino_fte.data_tools.track_links import link_pieces
 from acino_fte.data_tools.track_pieces import PiecedView, cut_at, cut_at_encounters, pieced
@@ -229,13 +229,17 @@ class _Matching:
         u = np.concatenate([e.a + offsets[a] for (a, _), e in self.evidence.items()])
         v = np.concatenate([e.b + offsets[b] for (_, b), e in self.evidence.items()])
         weight = np.concatenate([e.weight for e in self.evidence.values()])
-        prior = partner_log_odds(n_dots, u, v, weight, len(pieces))
+        price = float(
+            np.log(np.mean([animals_in_view(dots) for pair in self.angles for dots in self.dots(pair)]))
+        )
+        prior = partner_log_odds(n_dots, u, v, weight - price, len(pieces))
         edges = [(u, v, weight + prior[u] + prior[v])]
         for k, p in enumerate(pieces):
             if p.n:
                 earlier, later, odds = link_pieces(p, self.noise.total, self.max_gap)
                 edges.append((earlier + offsets[k], later + offsets[k], odds))
-        return PieceGraph(view, first, last, *(np.concatenate(part) for part in zip(*edges, strict=True)))
+        joint = (np.concatenate(part) for part in zip(*edges, strict=True))
+        return PieceGraph(view, first, last, *joint, price)
 
     def renew_noise(self, given: float | None) -> bool:
         """Noise of what is matched; whether it is another."""
