@@ -87,9 +87,10 @@ class Hessian:
 
     def _touched(self, first: Slot, second: Slot, of_second: np.ndarray) -> np.ndarray:
         """Entries (Q, …) that a pair of slots touches; ``of_second`` (items, …) is what moves the second."""
-        pairs = np.unique(np.stack([first.items, second.items], axis=1), axis=0)
-        left, right = self._movers(first)[pairs[:, 0]], of_second[pairs[:, 1]]
-        return (left.T.astype(float) @ right.astype(float)) > 0
+        movers = self._movers(first)
+        together = np.zeros((len(movers), len(of_second)))
+        together[first.items, second.items] = 1.0
+        return (movers.T @ together @ of_second) > 0
 
     def _movers(self, slot: Slot) -> np.ndarray:
         """(items, Q) bool: which degrees of freedom move the items of a slot."""

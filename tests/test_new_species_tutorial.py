@@ -8,21 +8,20 @@ import re
 import shlex
 import subprocess
 import sys
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 import acino_fte
-from acino_fte.cli_skeleton import app
+from acino_fte.cli import app
 from acino_fte.skeleton import load_skeleton
 from acino_fte.skeleton_check import check_skeleton
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 TUTORIAL = REPOSITORY / "docs" / "new_species.md"
 _EDIT = re.compile(r"# (?P<file>\S+), under '(?P<key>\w+:)'\n(?P<text>.*)", re.DOTALL)
-# the command 'acino-fte' of the interpreter that runs the tests, installed or not
-_COMMAND = [sys.executable, "-c", "from acino_fte.cli import main; main()"]
 
 
 def blocks(text: str) -> list[tuple[str, str]]:
@@ -31,16 +30,23 @@ def blocks(text: str) -> list[tuple[str, str]]:
 
 
 def arguments(line: str) -> list[str]:
-    """A command line of the tutorial as a list to run with this interpreter."""
+    """A command line that starts a script of the repository, for the interpreter that runs the tests."""
     words = shlex.split(line)
-    if words[0] == "acino-fte":
-        return [*_COMMAND, *words[1:]]
     assert words[0] == "python", line
     assert words[1].startswith("scripts/"), line
     return [sys.executable, str(REPOSITORY / words[1]), *words[2:]]
 
 
 def execute(line: str, folder: Path) -> str:
+    """What a command line prints. ``acino-fte`` runs in this process: a new one only imports everything again.
+
+    (That it starts as a program is a matter of test_run_cli.)
+    """
+    if line.startswith("acino-fte "):
+        with chdir(folder):
+            done = CliRunner(env={"COLUMNS": "200"}).invoke(app, shlex.split(line)[1:])
+        assert done.exit_code == 0, f"{line}\n{done.output}\n{done.exception!r}"
+        return done.stdout
     environment = {**os.environ, "PYTHONPATH": str(Path(acino_fte.__file__).parent.parent), "COLUMNS": "200"}
     result = subprocess.run(
         arguments(line), cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False
@@ -71,32 +77,32 @@ def follow(page: list[tuple[str, str]], folder: Path) -> str:
     return output
 
 
-def _needs_a_run(block: tuple[str, str]) -> bool:
-    return block[0] == "bash" and re.match(r"acino-fte (simulate|run) ", block[1]) is not None
+@pytest.fixture(scope="module")
+def tutorial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder in which the whole page was carried out, and what its commands printed."""
+    folder = tmp_path_factory.mktemp("tutorial")
+    return folder, follow(blocks(TUTORIAL.read_text()), folder)
 
 
-def test_the_skeleton_part(tmp_path: Path) -> None:
-    page = [block for block in blocks(TUTORIAL.read_text()) if not _needs_a_run(block)]
-    script = tmp_path / "skeleton"
-    script.mkdir()
-    output = follow([(kind, text) for kind, text in page if kind != "text"], script)
-    skeleton = load_skeleton(script / "fox.yaml")
+def test_the_skeleton_part(tutorial: tuple[Path, str]) -> None:
+    folder, output = tutorial
+    skeleton = load_skeleton(folder / "fox.yaml")
     assert {"l_ear", "r_ear"} <= set(skeleton.marker_names)
-    assert check_skeleton(script / "fox.yaml") == []
-    promised = next(text for kind, text in page if kind == "text")
+    assert check_skeleton(folder / "fox.yaml") == []
+    promised = next(text for kind, text in blocks(TUTORIAL.read_text()) if kind == "text")
     assert promised.strip() in output
     for name in ("fox.png", "fox_middle.png", "wolf.yaml", "species.schema.json"):
-        assert (script / name).stat().st_size > 1000
+        assert (folder / name).stat().st_size > 1000
 
 
-def test_the_whole_tutorial_ends_with_a_trajectory(tmp_path: Path) -> None:
-    follow(blocks(TUTORIAL.read_text()), tmp_path)
-    metrics = json.loads((tmp_path / "out" / "fox_fte" / "metrics.json").read_text())
+def test_the_whole_tutorial_ends_with_a_trajectory(tutorial: tuple[Path, str]) -> None:
+    folder, _ = tutorial
+    metrics = json.loads((folder / "out" / "fox_fte" / "metrics.json").read_text())
     assert metrics["status"] == "converged"
     assert metrics["species"] == "fox"
     assert metrics["frames"] == [0, 60]
     assert metrics["truth_mm"]["mpjpe"] < 10
-    assert (tmp_path / "out" / "fox_fte" / "report.html").is_file()
+    assert (folder / "out" / "fox_fte" / "report.html").is_file()
 
 
 def test_the_error_shown_is_the_one_that_is_given(tmp_path: Path) -> None:
@@ -106,11 +112,16 @@ def test_the_error_shown_is_the_one_that_is_given(tmp_path: Path) -> None:
     wrist = "noise: 12000}"
     assert wrist in path.read_text()
     path.write_text(path.read_text().replace(wrist, wrist + ", twist: {turn: z, range: [-30, 30]}"))
-    result = CliRunner().invoke(app, ["check", str(path)])
+    result = CliRunner().invoke(app, ["skeleton", "check", str(path)])
     assert result.exit_code == 2
     assert shown.strip() in result.output
 
 
-@pytest.mark.parametrize("line", ["acino-fte skeleton list", "python scripts/run_fte.py out -o x"])
-def test_commands_are_run_by_this_interpreter(line: str) -> None:
-    assert arguments(line)[0] == sys.executable
+def test_scripts_are_run_by_this_interpreter() -> None:
+    script = str(REPOSITORY / "scripts" / "run_fte.py")
+    assert arguments("python scripts/run_fte.py out -o x") == [sys.executable, script, "out", "-o", "x"]
+
+
+def test_a_command_that_fails_is_noticed(tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="missing"):
+        execute("acino-fte skeleton check missing.yaml", tmp_path)
