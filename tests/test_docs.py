@@ -2,7 +2,8 @@
 
 The two set-up commands install, which a test must not do; ``.ci/run`` does it, and here only what follows
 ``&&`` runs. The first of them draws figures; later runs do without, to save time.
-``docs/new_species.md`` has a test of its own, test_new_species_tutorial.
+``docs/new_species.md`` and ``docs/match_tracks.md`` have tests of their own, test_new_species_tutorial and
+test_match_tutorial.
 """
 
 from __future__ import annotations
@@ -25,12 +26,13 @@ from acino_fte.result_files import FILES
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 EXAMPLE = REPOSITORY / "examples" / "cheetah_gallop"
+BIRDS = REPOSITORY / "examples" / "bird_tracks"
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
 SET_UP = [
     "pip install . && python scripts/run_fte.py examples/cheetah_gallop",
     'pip install ".[test]" && pytest',
 ]
-_NOT_HERE = {"new_species.md"}
+_NOT_HERE = {"new_species.md", "match_tracks.md"}
 _KINDS = {"bash", "python", "yaml", "text"}
 _OTHERS = {"--check", "--help"}  # of ruff, of every command
 _NAMED = re.compile(r"# (?P<file>\S+\.yaml)\n")
@@ -42,8 +44,9 @@ def page_id(page: Path) -> str:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working folder with what the pages take to be there: the example, and recordings of a user's own."""
-    shutil.copytree(EXAMPLE, tmp_path / "examples" / EXAMPLE.name)
+    """A working folder with what the pages take to be there: the examples, and recordings of a user's own."""
+    for example in (EXAMPLE, BIRDS):
+        shutil.copytree(example, tmp_path / "examples" / example.name)
     make_acinoset(tmp_path / "2019_03_09")
     recording = tmp_path / "my_recording"
     shutil.copytree(EXAMPLE / "dlc", recording / "dlc")
@@ -85,7 +88,7 @@ def follow(page: Path, folder: Path) -> None:
             for line in filter(str.strip, text.splitlines()):
                 if line == SET_UP[1]:
                     continue  # this is it
-                quick = " --no-figures" if line.startswith("acino-fte run ") else ""
+                quick = " --no-figures" if line.startswith(("acino-fte run ", "acino-fte match ")) else ""
                 execute(line.split("&&")[1] if line == SET_UP[0] else line + quick, folder)
         elif language == "python":
             exec(compile(text, f"{page.name}: {text.splitlines()[0]}", "exec"), names)
