@@ -5,11 +5,14 @@ that group holds in its view at the time. The log-odds of each alternative again
 the same sums that made the groups, and
 
     P(right) = 1 / (1 + Σ exp(log-odds of an alternative)).
+
+A joining was priced with all the animals in view, of which any might have been the one; once the others have
+found theirs, only those still at large might, and the difference is paid back.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,12 +66,53 @@ def confidence_of(graph: PieceGraph, label: np.ndarray) -> Confidence:
     piece, group, gain = piece[other], group[other], gain[other]
     change = gain - own[piece] + _displaced(graph, label, own, piece, group)
     odds = np.exp(np.clip(change, -_MOST, _MOST))
-    against = np.exp(np.clip(-own, -_MOST, _MOST)) + np.bincount(piece, weights=odds, minlength=n)
+    alone = -own - (graph.price - np.log1p(np.minimum(_at_large(graph, joined), np.expm1(graph.price))))
+    against = np.exp(np.clip(alone, -_MOST, _MOST)) + np.bincount(piece, weights=odds, minlength=n)
     rival, best = np.full(n, -1), np.zeros(n)
     order = np.argsort(odds, kind="stable")  # the last one written is the largest
     rival[piece[order]], best[piece[order]] = group[order], odds[order]
     chance = 1.0 / (1.0 + against)
     return Confidence(np.where(joined, chance, np.nan), own, rival, best * chance)
+
+
+def _at_large(graph: PieceGraph, joined: np.ndarray) -> np.ndarray:
+    """Mean number of pieces of another view that are there with each piece and have joined nothing, (V,)."""
+    n_views, n_frames = int(graph.view.max(initial=0)) + 1, int(graph.last.max(initial=0)) + 2
+    change = np.zeros((n_views, n_frames))
+    alone = np.flatnonzero(~joined)
+    np.add.at(change, (graph.view[alone], graph.first[alone]), 1.0)
+    np.add.at(change, (graph.view[alone], graph.last[alone] + 1), -1.0)
+    there = np.cumsum(change, axis=1)
+    elsewhere = (there.sum(0) - there) / max(n_views - 1, 1)
+    total = np.concatenate([np.zeros((n_views, 1)), np.cumsum(elsewhere, axis=1)], axis=1)
+    span = total[graph.view, graph.last + 1] - total[graph.view, graph.first]
+    return span / (graph.last - graph.first + 1)
+
+
+def without_phantoms(confidence: Confidence, label: np.ndarray, prior: np.ndarray) -> Confidence:
+    """Doubt groups that consist only of pieces as clutter has them.
+
+    A piece of a length at which few have a partner is likelier to belong to an animal that is known from
+    longer pieces than to be all that was ever seen of another one. Groups of nothing else pay the logarithm
+    of the number of such pieces for each known animal.
+
+    Parameters
+    ----------
+    confidence : Confidence
+        Of the groups.
+    label : (V,) int
+        Group of every piece.
+    prior : (V,)
+        Log-odds of having a partner, 0 at most (:mod:`track_prior`).
+    """
+    unlikely = prior < 0
+    solid = np.zeros(len(label), dtype=bool)
+    solid[label[~unlikely & np.isfinite(confidence.probability)]] = True
+    price = np.log(max(unlikely.sum() / max(np.count_nonzero(solid), 1), 1.0))
+    with np.errstate(divide="ignore"):
+        odds = np.log(confidence.probability) - np.log1p(-confidence.probability)
+    doubted = 1.0 / (1.0 + np.exp(-(odds - price)))
+    return replace(confidence, probability=np.where(solid[label], confidence.probability, doubted))
 
 
 def _gains(graph: PieceGraph, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

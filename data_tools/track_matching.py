@@ -33,7 +33,7 @@ import numpy as np
 
 from acino_fte.data_tools.dot_linking import link_dots
 from acino_fte.data_tools.epipolar_angles import PlaneAngles, plane_angles, rays_of
-from acino_fte.data_tools.match_confidence import Confidence, confidence_of
+from acino_fte.data_tools.match_confidence import Confidence, confidence_of, without_phantoms
 from acino_fte.data_tools.match_noise import first_noise, matched_noise
 from acino_fte.data_tools.match_options import MatchOptions
 from acino_fte.data_tools.track_changes import find_changes
@@ -155,7 +155,7 @@ class _Matching:
         self.angles = self._plane_angles()
         self.noise = Noise(1.0)
         self.evidence: dict[tuple[int, int], Evidence] = {}
-        self.label = np.empty(0, dtype=np.int64)
+        self.label, self.prior = np.empty(0, dtype=np.int64), np.empty(0)
         self.graph: PieceGraph | None = None
 
     def _plane_angles(self) -> dict[tuple[int, int], tuple[PlaneAngles, PlaneAngles]]:
@@ -233,6 +233,7 @@ class _Matching:
             np.log(np.mean([animals_in_view(dots) for pair in self.angles for dots in self.dots(pair)]))
         )
         prior = partner_log_odds(n_dots, u, v, weight - price, len(pieces))
+        self.prior = prior
         edges = [(u, v, weight + prior[u] + prior[v])]
         for k, p in enumerate(pieces):
             if p.n:
@@ -294,7 +295,7 @@ class _Matching:
     def result(self, tell: Progress) -> TrackMatches:
         """Confidence, 3D paths and what leaves the function."""
         assert self.graph is not None
-        confidence = confidence_of(self.graph, self.label)
+        confidence = without_phantoms(confidence_of(self.graph, self.label), self.label, self.prior)
         group = _number_groups(self.graph, self.label, confidence, self.options.min_confidence)
         offsets = self.offsets
         found, sure, pieces = [], [], []
