@@ -38,7 +38,7 @@ def arguments(line: str) -> list[str]:
 
 
 def execute(line: str, folder: Path) -> str:
-    """What a command line prints. ``acino-fte`` runs in this process: a new one only imports everything again.
+    """What a command line prints. ``acino-fte`` runs in this process: a new one only takes time to import.
 
     (That it starts as a program is a matter of test_run_cli.)
     """
@@ -73,7 +73,9 @@ def follow(page: list[tuple[str, str]], folder: Path) -> str:
         if language == "yaml":
             edit(text, folder)
         elif language == "bash":
-            output += "".join(execute(line, folder) for line in text.splitlines() if line.strip())
+            for line in filter(str.strip, text.splitlines()):
+                quick = " --no-figures" if line.startswith("acino-fte run ") else ""  # test_docs draws them
+                output += execute(line + quick, folder)
     return output
 
 

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 import acino_fte
 from acino_fte.cli import app
+from acino_fte.plots import FIGURES
 from acino_fte.result_files import FILES
 from acino_fte.simulate import SimulationOptions, simulate
 from acino_fte.simulation_files import write_simulation
@@ -147,11 +148,14 @@ def test_explicit(recording, here):
     assert second["objective"] == pytest.approx(first["objective"], rel=1e-3)
 
 
-def test_figures(recording, here):
+def test_figures(recording, here, monkeypatch):
+    """Two of them, for time; test_plots draws all, and test_docs a whole result."""
+    names = ("reprojection_error", "camera_views")
+    monkeypatch.setattr("acino_fte.plots.FIGURES", {name: FIGURES[name] for name in names})
     result = run(recording, "--frames", ":4")
     assert result.exit_code == 0, result.output
-    figures = {p.suffix for p in (here / "out" / "gallop" / "figures").iterdir()}
-    assert {".png", ".pdf"} <= figures
+    figures = {p.name for p in (here / "out" / "gallop" / "figures").iterdir()}
+    assert figures == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
 
 
 @pytest.mark.parametrize("command", [[str(SCRIPT)], ["-m", "acino_fte", "run"]], ids=["script", "module"])
