@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from acino_fte import models
-from acino_fte.codegen import cached_programs
+from acino_fte.codegen import cache_folder, cached_programs
 from acino_fte.kinematics import Kinematics, derive_programs, load_kinematics
 from acino_fte.observability import random_poses
 from acino_fte.skeleton import Skeleton, expand, load_skeleton
@@ -345,15 +345,28 @@ def test_cached_programs_are_not_derived_again(cache: Path) -> None:
         cached_programs("test", ["another key"], never)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Kinematics, Path]:
+    """A small skeleton's kinematics, and the only file of the cache that they were put in."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ACINO_FTE_CACHE", str(tmp_path_factory.mktemp("whole")))
+        kinematics = load_kinematics(small_skeleton())
+        (file,) = cache_folder().glob("*.json")
+    return kinematics, file
+
+
 @pytest.mark.parametrize("damage", ["", "{", "[1, 2]", '{"positions": 3}', '{"positions": {"inputs": []}}'])
-def test_a_damaged_cache_file_is_derived_again(cache: Path, damage: str) -> None:
-    skeleton = small_skeleton()
-    whole = load_kinematics(skeleton)
-    (file,) = cache.glob("*.json")
-    text = file.read_text()
+def test_a_damaged_cache_file_is_derived_again(
+    cache: Path, whole: tuple[Kinematics, Path], damage: str
+) -> None:
+    kinematics, complete = whole
+    text = complete.read_text()
+    cache.mkdir(exist_ok=True)
+    file = cache / complete.name
     file.write_text(damage or text[: len(text) // 2])
-    again = load_kinematics(skeleton)
-    assert again.twist_program == whole.twist_program
+    again = load_kinematics(small_skeleton())
+    assert again.twist_program == kinematics.twist_program
+    assert list(cache.iterdir()) == [file]
     assert file.read_text() == text
 
 

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 from io import BytesIO
 
 import matplotlib
@@ -26,6 +27,12 @@ def result():
 def style():
     with matplotlib.rc_context(STYLE):
         yield
+
+
+@pytest.fixture(scope="module")
+def drawn(result):
+    """The figure of a name for the result as it is, drawn once."""
+    return cache(lambda name: FIGURES[name][1](result))
 
 
 def words(figure):
@@ -62,13 +69,13 @@ def test_every_figure_as_png_and_pdf(result, tmp_path):
         ("camera_views", ["u (px)", "v (px)", "cam3"]),
     ],
 )
-def test_labels_have_units(result, name, labels):
-    found = words(FIGURES[name][1](result))
+def test_labels_have_units(drawn, name, labels):
+    found = words(drawn(name))
     assert [label for label in labels if label not in found] == []
 
 
-def test_the_error_figure_prints_the_metrics(result):
-    text = "\n".join(words(FIGURES["reprojection_error"][1](result)))
+def test_the_error_figure_prints_the_metrics(result, drawn):
+    text = "\n".join(words(drawn("reprojection_error")))
     error = result.metrics["reprojection_px"]
     assert f"median {error['median']:.1f} px" in text
     assert f"RMSE {error['rmse']:.1f} px" in text
@@ -76,9 +83,9 @@ def test_the_error_figure_prints_the_metrics(result):
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_unconverged_is_marked(result, name):
+def test_unconverged_is_marked(result, drawn, name):
     assert "NOT CONVERGED: interrupted" in words(FIGURES[name][1](replace(result, status=Status.INTERRUPTED)))
-    assert not any("NOT CONVERGED" in w for w in words(FIGURES[name][1](result)))
+    assert not any("NOT CONVERGED" in w for w in words(drawn(name)))
 
 
 @pytest.mark.parametrize("case", ["one frame", "nothing seen", "behind", "odd names"])
@@ -175,15 +182,15 @@ def bands(figure, kind):
     return sum(isinstance(a, kind) for axes in figure.axes for a in axes.collections)
 
 
-def test_bands_where_there_are_deviations(result):
+def test_bands_where_there_are_deviations(result, drawn):
     estimated = with_estimates(result)
-    assert bands(FIGURES["joint_angles"][1](result), PolyCollection) == 0
+    assert bands(drawn("joint_angles"), PolyCollection) == 0
     turns = sum(dof.kind == "turn" for dof in result.skeleton.dofs)
     assert bands(FIGURES["joint_angles"][1](estimated), PolyCollection) == turns
     assert bands(FIGURES["body_motion"][1](estimated), PolyCollection) == 3
     assert bands(FIGURES["marker_positions"][1](estimated), PolyCollection) == 3 * 24
     assert bands(FIGURES["trajectory"][1](estimated), EllipseCollection) == 2
-    assert bands(FIGURES["trajectory"][1](result), EllipseCollection) == 0
+    assert bands(drawn("trajectory"), EllipseCollection) == 0
 
 
 def test_ellipses_have_two_standard_deviations(result):
@@ -212,7 +219,7 @@ def test_the_parameter_figure_shows_units_and_the_truth(result):
     assert (cross.get_xdata()[0], cross.get_ydata()[0]) == (pytest.approx(5.0), 1)
 
 
-def test_the_ladder_shows_every_rung(result):
+def test_the_ladder_shows_every_rung(result, drawn):
     figure = FIGURES["ladder"][1](with_evaluation(result))
     median, near = figure.axes
     labels = [label.get_text() for label in median.get_xticklabels()]
@@ -231,7 +238,7 @@ def test_the_ladder_shows_every_rung(result):
     lost.evaluation["ladder"][1]["heldout_px"]["median"] = None
     FIGURES["ladder"][1](lost).savefig(image, format="png", dpi=40)
     assert len(image.getvalue()) > 1000
-    assert any("no ladder was climbed" in word for word in words(FIGURES["ladder"][1](result)))
+    assert any("no ladder was climbed" in word for word in words(drawn("ladder")))
 
 
 def test_smooth_path_does_not_jump_when_markers_go(result):
