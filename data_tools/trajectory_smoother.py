@@ -137,7 +137,7 @@ class ChainFactor:
 
 
 def _cholesky(band: np.ndarray) -> np.ndarray:
-    """Banded Cholesky factor; rounding may need a little more on the diagonal when rows contradict each other."""
+    """Banded Cholesky factor, with a little more on the diagonal where rounding needs it."""
     for ridge in _RIDGES:
         firmer = band.copy()
         firmer[0] += ridge * np.abs(band[0])
