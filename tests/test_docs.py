@@ -22,6 +22,7 @@ from acino_fte.data_tools.calibration import read_cameras
 from acino_fte.data_tools.load import load_sequence
 from acino_fte.losses import DEFAULTS
 from acino_fte.parameters import FAMILIES
+from acino_fte.plots import FIGURES
 from acino_fte.result_files import FILES
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -100,6 +101,8 @@ def test_a_page_runs_from_top_to_bottom(page: Path, folder: Path) -> None:
     if page.name == "README.md":
         result = folder / "out" / "cheetah_gallop"
         assert set(FILES) == {path.name for path in result.iterdir()}
+        drawn = {f"{name}.{kind}" for name in set(FIGURES) - {"ladder"} for kind in ("png", "pdf")}
+        assert drawn == {path.name for path in (result / "figures").iterdir()}
         metrics = json.loads((result / "metrics.json").read_text())
         assert metrics["status"] == "converged"
         assert metrics["truth_mm"]["mpjpe"] <= 4.0
