@@ -435,7 +435,6 @@ def evaluate(kinematics, rounds=2, **options) -> Run:
     ("species", "options"),
     [
         ("cheetah", {"swaps": 0.1, "seed": 0}),
-        ("cheetah", {"swaps": 0.1, "seed": 1}),
         ("cheetah", {"swaps": 0.3, "seed": 2}),
         ("cheetah", {"swaps": 0.1, "seed": 3, "n_cameras": 3}),
         ("dog", {"swaps": 0.1, "motion": "wander", "n_frames": 80}),
