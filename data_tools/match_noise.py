@@ -78,7 +78,7 @@ def _best_partners(a: Dots, b: Dots, reach: float, fewest: int) -> np.ndarray:
     some = np.zeros(a.n_pieces, dtype=bool)
     some[long[:: max(1, len(long) // _N_WINDOWS)]] = True
     part = replace(a, piece=np.where((a.piece >= 0) & some[a.piece], a.piece, -1))
-    e = gather_evidence(part, b, Noise(reach / REACH), prune=False)
+    e = gather_evidence(part, b, Noise(reach / REACH), weigh=False)
     good = (e.shared >= fewest) & (e.near >= _ALWAYS * e.shared)
     best = np.full(a.n_pieces, np.inf)
     np.minimum.at(best, e.a[good], e.squares[good] / e.near[good])

@@ -138,7 +138,7 @@ def _batches(count: np.ndarray) -> Iterator[slice]:
         yield slice(first, stop)
 
 
-def gather_evidence(a: Dots, b: Dots, noise: Noise, prune: bool = True) -> Evidence:
+def gather_evidence(a: Dots, b: Dots, noise: Noise, weigh: bool = True) -> Evidence:
     """Weights of all pairs of pieces that are near each other in at least one frame in four.
 
     Parameters
@@ -147,8 +147,8 @@ def gather_evidence(a: Dots, b: Dots, noise: Noise, prune: bool = True) -> Evide
         Of the two views of a pair, with the plane angles of this pair.
     noise : Noise
         Of a dot's coordinate.
-    prune : bool
-        Whether to leave out hopeless pairs.
+    weigh : bool
+        Whether to give weights, and to leave out hopeless pairs.
     """
     chunks_of = groupby(near_dots(a, b, REACH * noise.total), key=lambda found: found[:2])
     parts = [_chunk_evidence(a, b, chunk, [f[2:] for f in found], noise) for chunk, found in chunks_of]
@@ -168,8 +168,10 @@ def gather_evidence(a: Dots, b: Dots, noise: Noise, prune: bool = True) -> Evide
     found = Evidence(
         piece_a, piece_b, near, shared, squares, sums, between, means, chunks, np.zeros(len(pairs))
     )
+    if not weigh:
+        return found
     found = replace(found, weight=_weights(a, b, noise, found))
-    return found.take(found.weight > _HOPELESS) if prune else found
+    return found.take(found.weight > _HOPELESS)
 
 
 def _chunk_evidence(

@@ -25,6 +25,7 @@ _TAIL = 4.0  # degrees of freedom of the t distribution
 _LEAST = 30
 _FAR, _BATCH = 12.0, 1_000_000
 _CALM, _CROWD = 0.2, 5.0
+_SAMPLE = 4_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +80,9 @@ def link_pieces(pieces: ViewPieces, noise: float, max_gap: int) -> tuple[np.ndar
     weight : (E,)
         Log-odds against every other continuation of either; only positive ones.
     """
+    if not _any_follows(pieces, max_gap):
+        none = np.empty(0, dtype=np.int64)
+        return none, none, np.empty(0)
     model = _learn(pieces, noise, max_gap)
     tail = _ends(pieces, noise, forwards=True)
     head = _ends(pieces, noise, forwards=False)
@@ -213,7 +217,7 @@ def _runs(pieces: ViewPieces, piece: np.ndarray, span: int) -> np.ndarray:
     rows = np.arange(max(len(piece) - span, 0))
     rows = rows[piece[rows] == piece[rows + span]]
     rows = rows[pieces.frame[rows + span] - pieces.frame[rows] == span]
-    return rows[:: max(1, len(rows) // 20_000)]
+    return rows[:: max(1, len(rows) // _SAMPLE)]
 
 
 def _typical(miss: np.ndarray) -> float:
@@ -271,6 +275,13 @@ def _against_chance(
         count = np.bincount(gap[chosen], minlength=longest + 1) + 3.0 / longest
         share = count / count[1:].sum()
     return odds
+
+
+def _any_follows(pieces: ViewPieces, max_gap: int) -> bool:
+    """Whether any piece begins within the longest gap after another has ended."""
+    first = np.sort(pieces.first)
+    low, high = (np.searchsorted(first, pieces.last + gap, side="right") for gap in (0, max_gap))
+    return bool((high > low).any())
 
 
 def _candidates(pieces: ViewPieces, max_gap: int) -> tuple[np.ndarray, np.ndarray]:

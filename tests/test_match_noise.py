@@ -82,7 +82,7 @@ def views(noise: Noise, n=2000, n_animals=5, seed=1):
 @pytest.mark.parametrize("noise", [Noise(2.0), Noise(2.0, 1.0), Noise(1.0, 3.0)])
 def test_white_and_slow_noise_of_what_is_matched(noise):
     pair = views(noise)
-    e = gather_evidence(*pair, Noise(noise.total), prune=False)
+    e = gather_evidence(*pair, Noise(noise.total), weigh=False)
     found = matched_noise([e], [e.a == e.b], Noise(9.0))
     assert found.white == pytest.approx(noise.white, rel=0.05)
     assert found.slow == pytest.approx(noise.slow, abs=0.15 * noise.total)
@@ -92,14 +92,14 @@ def test_noise_that_is_white_has_no_slow_part():
     slow = []
     for seed in range(8):
         pair = views(Noise(2.0), n=640, seed=seed)
-        e = gather_evidence(*pair, Noise(2.0), prune=False)
+        e = gather_evidence(*pair, Noise(2.0), weigh=False)
         slow.append(matched_noise([e], [e.a == e.b], Noise(2.0)).slow)
     assert max(slow) < 0.05 * 2.0  # no calibration is perfect
 
 
 def test_nothing_matched_keeps_what_was_known():
     pair = views(Noise(2.0), n=64)
-    e = gather_evidence(*pair, Noise(2.0), prune=False)
+    e = gather_evidence(*pair, Noise(2.0), weigh=False)
     before = Noise(7.0, 1.0)
     assert matched_noise([e], [np.zeros(len(e.a), dtype=bool)], before) is before
 

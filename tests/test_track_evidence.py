@@ -129,7 +129,7 @@ def test_sums_against_a_loop(noise):
                     sums += [n, squares, total, mean / (noise.white**2 + n * noise.slow**2), mean, 1]
             if sums[0]:
                 wanted[k, m] = (*sums, len(both))
-    e = gather_evidence(a, b, noise, prune=False)
+    e = gather_evidence(a, b, noise, weigh=False)
     assert set(zip(e.a.tolist(), e.b.tolist(), strict=True)) == wanted.keys()
     assert len(wanted) > 10
     columns = e.near, e.squares, e.sums, e.between, e.squared_means, e.chunks, e.shared
@@ -248,7 +248,7 @@ def two_views(moving: bool, noise: Noise, seed: int, n: int = 192) -> tuple[Dots
 
 
 def weight_of_first(pair, noise) -> float:
-    e = gather_evidence(*pair, noise, prune=False)
+    e = gather_evidence(*pair, noise)
     return float(e.weight[(e.a == 0) & (e.b == 0)][0])
 
 
