@@ -23,6 +23,30 @@ from acino_fte.terms import measurement_term
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
 
+# Files that take a minute or so, longest first: begun last, they would keep one process waiting.
+LONGEST = (
+    "test_lily",
+    "test_lily_ladder",
+    "test_docs",
+    "test_calibration",
+    "test_run_cli",
+    "test_plots",
+    "test_recovery",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep pytest-xdist to the order of collection: it would put files of few tests, the longest, last."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first; the others stay in their order."""
+    rank = {name: i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
 FPS = 100.0
 FISHEYE = (0.037, 0.048, -0.038, 0.011)
 PINHOLE = (-0.12, 0.05, 0.001, -0.0007, 0.01)
