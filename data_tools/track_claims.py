@@ -32,6 +32,7 @@ _BEYOND = 8
 _NEVER = 1e3
 _SPAN = np.int64(1 << 40)  # more than the frames of any recording
 _SURE = 0.9
+_EM_STEPS = 30
 _MOST_ROUNDS, _FEW = 12, 0.003
 
 
@@ -164,9 +165,37 @@ def _claims(matches: TrackMatches, paths: Trajectories, k: int) -> tuple[np.ndar
     row, at, squared, inverse = row[near], at[near], squared[near], inverse[near]
     area = float(np.prod(np.ptp(view.xy, axis=0) + 1.0))
     density = max(len(loose), 1) / max(len(np.unique(view.frame)), 1) / area
-    odds = np.exp(-0.5 * squared) / (2 * np.pi * np.sqrt(determinant[inverse]) * density)
-    chosen, probability = _settle(row, at, np.log(odds))
+    ratio = np.exp(-0.5 * squared) / (2 * np.pi * np.sqrt(determinant[inverse]) * density)
+    beyond = paths.source == SOURCES.index("extended")
+    prior = np.zeros(len(row))
+    for kind in (beyond, ~beyond):
+        claims = kind[at]
+        prior[claims] = _log_odds_of_loose(ratio[claims], at[claims], np.count_nonzero(kind[point]))
+    chosen, probability = _settle(row, at, np.log(ratio) + prior)
     return row[chosen], paths.group[at[chosen]], probability
+
+
+def _log_odds_of_loose(ratio: np.ndarray, place: np.ndarray, n_places: int) -> float:
+    """Log-odds that a place of a path without a dot has one among the loose, by expectation–maximisation.
+
+    Where a detector misses animals and sees clutter there is none to be claimed; after an encounter there is.
+
+    Parameters
+    ----------
+    ratio : (E,)
+        Likelihood ratio of each claim against a chance dot.
+    place : (E,) int
+        Path point of each claim.
+    n_places : int
+        Path points without a dot in this view.
+    """
+    _, which = np.unique(place, return_inverse=True)
+    total = np.bincount(which, weights=ratio)
+    share = 0.5
+    for _ in range(_EM_STEPS):
+        found = share * total / (1.0 - share + share * total)
+        share = (found.sum() + 0.5) / (n_places + 1.0)
+    return float(np.log(share) - np.log1p(-share))
 
 
 def _settle(row: np.ndarray, point: np.ndarray, odds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
