@@ -4,8 +4,9 @@ A piece of track that lies further from what all other dots of its animal predic
 the paths of one animal on both sides of a gap are joined (:mod:`track_joins`). A dot that no animal has,
 because a detector lost it in an encounter or its piece was too short to decide, goes to the animal whose path
 runs through it: with the squared distance z from the predicted pixel, the determinant |S| of its covariance
-and the density ρ of loose dots, the odds of the pair are exp(−z/2)/(2π √|S| ρ); in every frame and view the
-claims are settled together, and one that another claim makes uncertain is left.
+and the density ρ of loose dots, the odds of the pair are exp(−z/2)/(2π √|S| ρ) times the odds
+that a place without a dot has one among the loose ones at all, which the recording tells. In every frame and
+view the claims are settled together, and one that another claim makes uncertain is left.
 """
 
 from __future__ import annotations
