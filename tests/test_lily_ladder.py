@@ -14,9 +14,10 @@ pytestmark = test_lily.pytestmark
 def metrics(tmp_path_factory):
     """The middle camera of either side of the track left out, with nothing fitted and family by family.
 
-    All frames and markers, about 2900 detections. What is claimed of the ladder is claimed of all six cameras,
-    and measured by benchmarks/bench_ladder.py (15.4, 15.0, 13.9, 12.3, 9.9 px); this guards it in less than half
-    the time. The two were chosen with the numbers of every camera known: not every pair falls at each rung.
+    All frames and markers, about 2900 detections. What is claimed of the ladder is claimed of all six
+    cameras, and measured by benchmarks/bench_ladder.py (15.4, 15.0, 13.9, 12.3, 9.9 px); this guards it in
+    less than half the time. The two were chosen with the numbers of every camera known: not every pair falls
+    at each rung.
     """
     evaluation = ("--holdout-cameras", "cam2,cam5", "--ladder")
     return run(tmp_path_factory.mktemp("lily") / "ladder", *STRIDE, *FAMILIES, *evaluation)[1]
