@@ -171,7 +171,7 @@ def _claims(matches: TrackMatches, paths: Trajectories, k: int) -> tuple[np.ndar
     prior = np.zeros(len(row))
     for kind in (beyond, ~beyond):
         claims = kind[at]
-        prior[claims] = _log_odds_of_loose(ratio[claims], at[claims], np.count_nonzero(kind[point]))
+        prior[claims] = _log_odds_of_loose(ratio[claims], at[claims], int(kind[point].sum()))
     chosen, probability = _settle(row, at, np.log(ratio) + prior)
     return row[chosen], paths.group[at[chosen]], probability
 

@@ -7,7 +7,8 @@
 Tracks decide, not frames: a dot is near many epipolar lines, a track stays near one. In the order of the
 work:
 
-0. bare points are joined to pieces of track within their view (:mod:`dot_linking`);
+0. bare points are joined to pieces of track, within their view (:mod:`dot_linking`) or over all views
+   (:mod:`dot_pairs`);
 1. every dot's plane angle in every pair of views (:mod:`epipolar_angles`); the noise, from the data
    (:mod:`match_noise`);
 2. pieces of tracks that plainly continue one another are stitched within each view (:mod:`track_links`);
@@ -32,6 +33,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acino_fte.data_tools.dot_linking import link_dots
+from acino_fte.data_tools.dot_pairs import clearer, link_jointly
 from acino_fte.data_tools.epipolar_angles import PlaneAngles, plane_angles, rays_of
 from acino_fte.data_tools.match_confidence import Confidence, confidence_of, without_phantoms
 from acino_fte.data_tools.match_noise import first_noise, matched_noise
@@ -45,7 +47,7 @@ from acino_fte.data_tools.track_links import link_pieces
 from acino_fte.data_tools.track_pieces import PiecedView, cut_at, cut_at_encounters, pieced
 from acino_fte.data_tools.track_prior import partner_log_odds
 from acino_fte.data_tools.track_reassignment import reassign
-from acino_fte.data_tools.tracks2d import BARE, TrackRecording, Tracks2D
+from acino_fte.data_tools.tracks2d import BARE, TrackRecording
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:
@@ -119,6 +121,8 @@ def match_tracks(
     options = options or MatchOptions()
     tell = progress or (lambda step: None)
     matching = _Matching(recording, options)
+    tell("joining bare points")
+    matching.link_bare_points()
     tell("noise")
     matching.estimate_noise(options.noise_px)
     tell("stitching within views")
@@ -147,16 +151,37 @@ class _Matching:
     def __init__(self, recording: TrackRecording, options: MatchOptions) -> None:
         _check(recording)
         self.recording, self.options = recording, options
-        first = recording.first_frame
-        self.views: list[PiecedView] = [
-            pieced(view.frame - first, _tracks(view, options), view.xy) for view in recording.views
-        ]
+        self.tracks = [v.track if options.tracks else np.full(len(v), BARE) for v in recording.views]
+        self.views: list[PiecedView] = self._pieced(self.tracks)
         self.max_gap = max(1, round(options.max_gap_s * (recording.fps or _FPS)))
         self.angles = self._plane_angles()
         self.noise = Noise(1.0)
         self.evidence: dict[tuple[int, int], Evidence] = {}
         self.label, self.prior = np.empty(0, dtype=np.int64), np.empty(0)
         self.graph: PieceGraph | None = None
+
+    def _pieced(self, tracks: list[np.ndarray]) -> list[PiecedView]:
+        first = self.recording.first_frame
+        return [
+            pieced(view.frame - first, track, view.xy)
+            for view, track in zip(self.recording.views, tracks, strict=True)
+        ]
+
+    def link_bare_points(self) -> None:
+        """Bare points to pieces of track: within each view, and over all of them where that joins more."""
+        views, first = self.recording.views, self.recording.first_frame
+        bare = [np.flatnonzero(track == BARE) for track in self.tracks]
+        if not any(len(rows) for rows in bare):
+            return
+        frames = [view.frame[rows] - first for view, rows in zip(views, bare, strict=True)]
+        xys = [view.xy[rows] for view, rows in zip(views, bare, strict=True)]
+        single = [link_dots(*dots, self.options.noise_px) for dots in zip(frames, xys, strict=True)]
+        self.views = self._pieced(_with_pieces(self.tracks, bare, single))
+        self.estimate_noise(self.options.noise_px)
+        joint = link_jointly(self.recording.cameras, frames, xys, self.noise.total)
+        pieces = [clearer(one, all_) for one, all_ in zip(single, joint, strict=True)]
+        self.tracks = _with_pieces(self.tracks, bare, pieces)
+        self.views = self._pieced(self.tracks)
 
     def _plane_angles(self) -> dict[tuple[int, int], tuple[PlaneAngles, PlaneAngles]]:
         cameras = self.recording.cameras
@@ -324,16 +349,16 @@ class _Matching:
         return matches
 
 
-def _tracks(view: Tracks2D, options: MatchOptions) -> np.ndarray:
-    """Track of every row, with bare points joined to pieces within the view; −1 for what stays alone."""
-    track = view.track if options.tracks else np.full(len(view), BARE)
-    bare = np.flatnonzero(track == BARE)
-    if not len(bare):
-        return track
-    piece = link_dots(view.frame[bare], view.xy[bare], options.noise_px)
-    track = track.copy()
-    track[bare] = np.where(piece >= 0, piece + track.max(initial=BARE) + 1, BARE)
-    return track
+def _with_pieces(
+    tracks: list[np.ndarray], bare: list[np.ndarray], pieces: list[np.ndarray]
+) -> list[np.ndarray]:
+    """Tracks of every view with pieces of bare points after them."""
+    joined = []
+    for track, rows, piece in zip(tracks, bare, pieces, strict=True):
+        whole = track.copy()
+        whole[rows] = np.where(piece >= 0, piece + track.max(initial=BARE) + 1, BARE)
+        joined.append(whole)
+    return joined
 
 
 def _of_piece(values: np.ndarray, piece: np.ndarray, otherwise: float) -> np.ndarray:
