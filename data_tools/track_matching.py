@@ -121,8 +121,9 @@ def match_tracks(
     options = options or MatchOptions()
     tell = progress or (lambda step: None)
     matching = _Matching(recording, options)
-    tell("joining bare points")
-    matching.link_bare_points()
+    if any((track == BARE).any() for track in matching.tracks):
+        tell("joining bare points")
+        matching.link_bare_points()
     tell("noise")
     matching.estimate_noise(options.noise_px)
     tell("stitching within views")
@@ -171,8 +172,6 @@ class _Matching:
         """Bare points to pieces of track: within each view, and over all of them where that joins more."""
         views, first = self.recording.views, self.recording.first_frame
         bare = [np.flatnonzero(track == BARE) for track in self.tracks]
-        if not any(len(rows) for rows in bare):
-            return
         frames = [view.frame[rows] - first for view, rows in zip(views, bare, strict=True)]
         xys = [view.xy[rows] for view, rows in zip(views, bare, strict=True)]
         single = [link_dots(*dots, self.options.noise_px) for dots in zip(frames, xys, strict=True)]
