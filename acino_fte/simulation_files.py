@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -66,6 +68,20 @@ def write_simulation(
         The folder exists and is not to be replaced, or cannot be made.
     """
     folder = check_target(folder, overwrite=overwrite)
+    with whole_folder(folder) as work:
+        _write_files(simulation, work, folder.name, command or "acino_fte.simulate.simulate (from Python)")
+    return folder
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder to fill, which takes the name of `folder` at the end; on failure nothing is left.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be made.
+    """
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -77,13 +93,12 @@ def write_simulation(
             remedy="choose a folder in which you may write",
         ) from None
     try:
-        _write_files(simulation, work, folder.name, command or "acino_fte.simulate.simulate (from Python)")
+        yield work
         work.chmod(0o755)  # mkdtemp makes a private one
         _rename(work, folder)
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)
         raise
-    return folder
 
 
 def check_target(folder: Path | str, *, overwrite: bool) -> Path:

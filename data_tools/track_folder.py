@@ -12,8 +12,6 @@ truth_3d.csv        frame, animal, x, y, z (m); for scoring only
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +20,7 @@ from acino_fte.cameras import CameraArray
 from acino_fte.data_tools.calibration import write_cameras
 from acino_fte.data_tools.tracks2d import TrackRecording, Tracks2D
 from acino_fte.errors import InputError
+from acino_fte.simulation_files import whole_folder
 
 
 def write_tracks(recording: TrackRecording, folder: Path | str) -> Path:
@@ -49,23 +48,8 @@ def write_tracks(recording: TrackRecording, folder: Path | str) -> Path:
         raise InputError(
             "The target exists; it is left alone.", file=folder, remedy="choose another folder, or remove it"
         )
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    except OSError as error:
-        raise InputError(
-            "The folder cannot be made.",
-            file=folder,
-            found=error.strerror or str(error),
-            remedy="choose a folder in which you may write",
-        ) from None
-    try:
+    with whole_folder(folder) as work:
         _write_files(recording, work)
-        work.chmod(0o755)  # mkdtemp makes a private one
-        work.replace(folder)
-    except BaseException:
-        shutil.rmtree(work, ignore_errors=True)
-        raise
     return folder
 
 
