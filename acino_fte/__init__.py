@@ -15,6 +15,10 @@ The trajectory problem alone, without estimating noise or parameters:
 >>> problem = af.build_fte(sequence, kinematics)                 # doctest: +SKIP
 >>> start = af.initial_trajectory(sequence, kinematics)          # doctest: +SKIP
 >>> result = af.solve_fte(problem, start)                        # doctest: +SKIP
+
+Animals without markers, as 2D tracks of several cameras:
+
+>>> matches = af.match_tracks(af.load_tracks("examples/bird_tracks"))  # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -46,6 +50,13 @@ _PUBLIC = {
     "FTEResult": "result",
     "Status": "result",
     "load_sequence": "data_tools.load",
+    "load_tracks": "data_tools.load_tracks",
+    "MatchOptions": "data_tools.match_options",
+    "match_tracks": "data_tools.track_matching",
+    "score_matching": "data_tools.match_metrics",
+    "smooth_trajectories": "data_tools.trajectories3d",
+    "TrackSimulation": "data_tools.simulate_tracks",
+    "simulate_tracks": "data_tools.simulate_tracks",
 }
 
 __all__ = ["__version__", *_PUBLIC]
