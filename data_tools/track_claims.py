@@ -59,8 +59,30 @@ def claim_loose_dots(matches: TrackMatches, max_gap: int) -> TrackMatches:
         matches = joined
         if won <= _FEW * n_rows:
             break
-    paths = _without_extension(paths) if same else _paths(matches, max_gap, motion=paths.motion)
-    return replace(matches, trajectories=paths)
+    tidy = _numbered(matches)
+    same &= tidy is matches
+    paths = _without_extension(paths) if same else _paths(tidy, max_gap, motion=paths.motion)
+    return replace(tidy, trajectories=paths)
+
+
+def _numbered(matches: TrackMatches) -> TrackMatches:
+    """Groups that one view alone is left of are none; the others in the order of their first frames."""
+    n = matches.n_groups
+    views, first = np.zeros(n, dtype=int), np.full(n, np.iinfo(np.int64).max)
+    for view, group in zip(matches.recording.views, matches.groups, strict=True):
+        rows = group >= 0
+        views[np.unique(group[rows])] += 1
+        np.minimum.at(first, group[rows], view.frame[rows])
+    kept = np.flatnonzero(views >= 2)
+    number = np.full(n + 1, -1)  # the last one for no group
+    number[kept[np.argsort(first[kept], kind="stable")]] = np.arange(len(kept))
+    if np.array_equal(number[:n], np.arange(n)):
+        return matches
+    groups = tuple(number[group] for group in matches.groups)
+    sure = tuple(np.where(g >= 0, c, np.nan) for g, c in zip(groups, matches.confidence, strict=True))
+    rival = number[matches.rival]
+    likely = np.where(rival >= 0, matches.rival_probability, 0.0)
+    return replace(matches, groups=groups, confidence=sure, rival=rival, rival_probability=likely)
 
 
 def _joined(before: TrackMatches, claimed: TrackMatches, group: np.ndarray) -> TrackMatches:
@@ -113,7 +135,7 @@ def _without_strangers(matches: TrackMatches, paths: Trajectories) -> TrackMatch
     """Pieces most of whose dots are not on their group's path leave it.
 
     A tracker's piece was cut wherever another view contradicts it, so its dots are of one animal; a few of
-    them off the path tell of a sudden turn.
+    them off the path tell of a sudden turn. Dots in no piece were claimed one by one, and leave one by one.
     """
     n = len(matches.rival)
     off, all_ = np.zeros(n + 1), np.zeros(n + 1)
@@ -122,8 +144,9 @@ def _without_strangers(matches: TrackMatches, paths: Trajectories) -> TrackMatch
         all_ += np.bincount(piece[group >= 0] + 1, minlength=n + 1)
     stranger = off > 0.5 * all_
     groups, sure = [], []
-    for piece, group, confidence in zip(matches.pieces, matches.groups, matches.confidence, strict=True):
-        leaves = stranger[piece + 1]
+    parts = zip(matches.pieces, paths.wrong, matches.groups, matches.confidence, strict=True)
+    for piece, wrong, group, confidence in parts:
+        leaves = np.where(piece < 0, wrong, stranger[piece + 1])
         groups.append(np.where(leaves, -1, group))
         sure.append(np.where(leaves, np.nan, confidence))
     return replace(matches, groups=tuple(groups), confidence=tuple(sure))
