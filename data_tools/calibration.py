@@ -245,7 +245,22 @@ def _with_file(error: InputError, path: Path, key: str) -> InputError:
 
 
 def write_cameras(path: Path | str, cameras: CameraArray) -> None:
-    """Write cameras as the project's own JSON file; numbers keep every digit."""
+    """Write cameras as the project's own JSON file; numbers keep every digit.
+
+    Raises
+    ------
+    InputError
+        A camera is of a kind that the file has no words for: skew (DLT), or Vicon's lens.
+    """
+    for camera in cameras:
+        if type(camera) is not Camera:
+            raise InputError(
+                f"Camera '{camera.name}' cannot be written as '{FORMAT}'.",
+                file=path,
+                expected="pinhole and fisheye cameras of OpenCV's kind",
+                found=f"a {type(camera).__name__}, which may have skew or another lens",
+                remedy="keep its own file (DLT coefficients, .xcp)",
+            )
     entries = [
         {
             "name": camera.name,

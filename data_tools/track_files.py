@@ -297,6 +297,6 @@ def _check_single(view: Tracks2D) -> None:
             file=view.path,
             key=f"rows {view.row[first] + 1} and {view.row[second] + 1} after the header",
             expected="one row for each track and frame",
-            found=f"{len(again)} rows too many",
+            found=f"{len(again)} row{'' if len(again) == 1 else 's'} too many",
             remedy="give the animals tracks of their own, or leave the track empty for single dots",
         )

@@ -10,6 +10,7 @@ from conftest import look_at
 from scipy.spatial.transform import Rotation
 
 from acino_fte.cameras import Camera, CameraArray
+from acino_fte.data_tools.calibration import write_cameras
 from acino_fte.data_tools.dlt import read_dlt
 from acino_fte.data_tools.epipolar import ideal_pixels
 from acino_fte.data_tools.projective_camera import (
@@ -288,3 +289,11 @@ def test_bats_as_dltdv_has_them(name, count, median_px):
     assert np.nanmedian(distance) < median_px
     for camera in cameras:
         assert abs(camera.parameters[4]) < 0.1 and camera.parameters[:2] == pytest.approx(526, abs=3)
+
+
+def test_a_file_without_words_for_skew_refuses_it(tmp_path):
+    """Written without, it would be another camera."""
+    with pytest.raises(InputError, match="Camera 'c' cannot be written") as caught:
+        write_cameras(tmp_path / "cameras.json", CameraArray((camera(),)))
+    assert "ProjectiveCamera" in str(caught.value)
+    assert not (tmp_path / "cameras.json").exists()
