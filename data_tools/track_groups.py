@@ -121,8 +121,9 @@ def total_log_odds(graph: PieceGraph, label: np.ndarray) -> tuple[np.ndarray, np
         Log-odds, overlaps without an edge included.
     """
     names, dense = np.unique(label, return_inverse=True)
-    occupied = np.zeros((len(names), *_shape(graph)), dtype=np.uint8)
-    np.bitwise_or.at(occupied, dense, _occupancy(graph))
+    order = np.argsort(dense, kind="stable")
+    heads = np.searchsorted(dense[order], np.arange(len(names)))
+    occupied = np.bitwise_or.reduceat(_occupancy(graph)[order], heads, axis=0)
     edges = _contract(_Edges.of(graph), dense)
     total, compatible = _totals(edges, occupied, graph.price)
     return names[edges.u[compatible]], names[edges.v[compatible]], total[compatible]
@@ -140,14 +141,19 @@ def _overlap(graph: PieceGraph, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def _occupancy(graph: PieceGraph) -> np.ndarray:
     """(V, views, bytes) bit field: the frames in which a group has a piece in a view."""
-    n_frames = int(graph.last.max()) + 1
-    frames = np.arange(n_frames)
     occupied = np.zeros((len(graph.view), *_shape(graph)), dtype=np.uint8)
-    step = max(1, _BYTES // n_frames)
+    byte = np.arange(occupied.shape[2])
+    low, high = graph.first // 8, graph.last // 8
+    head = (0xFF >> (graph.first % 8)).astype(np.uint8)  # the first frame is the highest bit
+    tail = (0xFF00 >> (graph.last % 8 + 1) & 0xFF).astype(np.uint8)
+    step = max(1, _BYTES // len(byte))
     for start in range(0, len(graph.view), step):
         part = np.arange(start, min(start + step, len(graph.view)))
-        there = (frames >= graph.first[part, None]) & (frames <= graph.last[part, None])
-        occupied[part, graph.view[part]] = np.packbits(there, axis=1)
+        inside = (byte >= low[part, None]) & (byte <= high[part, None])
+        occupied[part, graph.view[part]] = np.where(inside, 0xFF, 0)
+    pieces = np.arange(len(graph.view))
+    occupied[pieces, graph.view, low] &= head
+    occupied[pieces, graph.view, high] &= tail
     return occupied
 
 
