@@ -21,7 +21,8 @@ from acino_fte.data_tools.epipolar import (
     sampson_distance,
 )
 from acino_fte.data_tools.trajectories3d import SOURCES, Trajectories
-from acino_fte.data_tools.trajectory_rows import at_rows, has_pose, project_rows
+from acino_fte.data_tools.trajectory_motion import Pieces
+from acino_fte.data_tools.trajectory_rows import Nodes, at_rows, has_pose, project_rows
 from acino_fte.triangulate import triangulate
 
 if TYPE_CHECKING:
@@ -73,18 +74,7 @@ class SpacePoints:
 
     def find(self, group: np.ndarray, frame: np.ndarray) -> np.ndarray:
         """Index of the point of each (group, frame), (P,); −1 where there is none."""
-        if not len(self):
-            return np.full(len(group), -1)
-        base, span = _span(self.frame)
-        keys, wanted = self.group * span + (self.frame - base), group * span + (frame - base)
-        place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        there = (keys[place] == wanted) & (group >= 0) & (frame >= base) & (frame < base + span)
-        return np.where(there, place, -1)
-
-
-def _span(frame: np.ndarray) -> tuple[int, int]:
-    base = int(frame.min())
-    return base, int(frame.max()) - base + 1
+        return Nodes(Pieces(np.zeros(0, dtype=int)), self.group, self.frame).find(group, frame)
 
 
 def space_points(matches: TrackMatches) -> SpacePoints:

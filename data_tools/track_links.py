@@ -17,8 +17,6 @@ import numpy as np
 
 from acino_fte.data_tools.track_dots import runs
 
-MAX_GAP_S = 1.0
-_DEFAULT_GAP = 30
 _FIT = 4
 _LONGEST, _AGREE = 32, 3.0
 _TAIL = 4.0  # degrees of freedom of the t distribution
