@@ -33,7 +33,7 @@ class KeyedCamera:
     translation : (K, 3)
         World to camera, in units of the world.
     covariance : (K, 6, 6), optional
-        Of each pose: turn (rad, in the camera's frame: R_true = exp(turn×) R) and shift of the centre (world).
+        Of each pose: turn (rad, in the camera's frame: R_true = exp(turn×) R), shift of the centre (world).
     """
 
     name: str

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from acino_fte.data_tools.similarity import Similarity
 
 SOURCES = ("views", "single", "interpolated")
-"""Seen by two views or more; by one, depth from the individual's own path; by none, between frames that are."""
+"""Seen by two views or more; by one, depth from its own path; by none, between others."""
 
 
 @dataclass(frozen=True, eq=False)

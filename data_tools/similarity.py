@@ -1,4 +1,4 @@
-"""Similarities between worlds: x' = scale · rotation @ x + translation, for points, cameras and covariances."""
+"""Similarities between worlds, x' = scale · rotation @ x + translation: points, cameras, covariances."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Similarity:
         return self.scale**2 * (self.rotation @ covariance @ self.rotation.T)
 
     def poses(self, rotation: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World-to-camera rotations (…, 3, 3) and translations (…, 3) of the same cameras in the target world.
+        """Poses (…, 3, 3), (…, 3), world to camera, of the same cameras in the target world.
 
         The camera's own frame is scaled with the world: x_camera' = scale · x_camera.
         """
@@ -66,7 +66,7 @@ class Similarity:
         return turned, self.scale * translation - turned @ self.translation
 
     def pose_covariance(self, covariance: np.ndarray) -> np.ndarray:
-        """Covariances (…, 6, 6) of poses: turn in the camera's frame, rad; shift of the centre in the world."""
+        """Covariances (…, 6, 6) of poses: turn (camera frame, rad), shift of the centre (world)."""
         change = np.eye(6)
         change[3:, 3:] = self.scale * self.rotation
         return change @ covariance @ change.T
