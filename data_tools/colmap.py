@@ -313,7 +313,7 @@ def _poses(rigid: list[Any], file: Path) -> tuple[np.ndarray, np.ndarray]:
             "A pose of the COLMAP model is impossible.",
             file=file,
             expected="quaternions of length 1, finite translations",
-            found=f"{int(wrong.sum())} of {len(wrong)} poses wrong, a quaternion of length {norm[wrong][0]:.4g}",
+            found=f"{int(wrong.sum())} of {len(wrong)} poses, a quaternion of length {norm[wrong][0]:.4g}",
             remedy="export the model again; the columns are QW, QX, QY, QZ, TX, TY, TZ",
         )
     return _rotations(quaternion / norm[:, None]), translation
