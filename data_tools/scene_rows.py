@@ -109,17 +109,31 @@ def clean_rows(rows: TrackRows, camera: str, path: Path) -> tuple[TrackRows, lis
     if not len(rows):
         return rows, notes
     _check_pixels(rows, camera, path)
-    span = int(rows.frame.max()) + 1
-    key = rows.code * span + rows.frame
-    order = np.argsort(key, kind="stable")
-    if (np.diff(key[order]) == 0).any():
-        order = np.lexsort((rows.xy[:, 1], rows.xy[:, 0], key))
-        again = np.diff(key[order]) == 0
-        apart = np.abs(np.diff(rows.xy[order], axis=0)).max(1) > _SAME
-        _check_places(rows, order, again & apart, camera, path)
-        order = order[np.append(True, ~again)]
-        notes.append(f"{_rows(int(again.sum()))} of camera '{camera}' are copies of others: left out.")
+    order, n_copies = places_in_order(rows, camera, path)
+    if n_copies:
+        notes.append(f"{_rows(n_copies)} of camera '{camera}' are copies of others: left out.")
     return rows.at_rows(order), notes
+
+
+def places_in_order(rows: TrackRows, camera: str, path: Path | None) -> tuple[np.ndarray, int]:
+    """The order by individual, then frame, without copies of a row, and how many copies there are.
+
+    Raises
+    ------
+    InputError
+        An individual has two places in one frame.
+    """
+    if not len(rows):
+        return np.zeros(0, dtype=np.int64), 0
+    key = rows.code * (int(np.ptp(rows.frame)) + 1) + (rows.frame - rows.frame.min())
+    order = np.argsort(key, kind="stable")
+    if not (np.diff(key[order]) == 0).any():
+        return order, 0
+    order = np.lexsort((rows.row, rows.xy[:, 1], rows.xy[:, 0], key))
+    again = np.diff(key[order]) == 0
+    apart = np.abs(np.diff(rows.xy[order], axis=0)).max(1) > _SAME
+    _check_places(rows, order, again & apart, camera, path)
+    return order[np.append(True, ~again)], int(again.sum())
 
 
 def joined_tracks(
@@ -176,7 +190,9 @@ def _check_pixels(rows: TrackRows, camera: str, path: Path) -> None:
     )
 
 
-def _check_places(rows: TrackRows, order: np.ndarray, wrong: np.ndarray, camera: str, path: Path) -> None:
+def _check_places(
+    rows: TrackRows, order: np.ndarray, wrong: np.ndarray, camera: str, path: Path | None
+) -> None:
     if not wrong.any():
         return
     at = int(np.argmax(wrong))
