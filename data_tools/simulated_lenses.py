@@ -61,7 +61,7 @@ def scene_lens(
 
 
 def colmap_parameters(name: str, lens: Camera) -> np.ndarray:
-    """Parameters in COLMAP's order, with the first pixel's centre at (0.5, 0.5).
+    """Parameters in COLMAP's order, but pixel centres at integers (COLMAP adds 0.5 to the principal point).
 
     Parameters
     ----------
@@ -72,5 +72,4 @@ def colmap_parameters(name: str, lens: Camera) -> np.ndarray:
     """
     two = SCENE_LENSES[name][1]
     focal = np.diag(lens.matrix)[: 2 if two else 1]
-    middle = lens.matrix[:2, 2] + 0.5
-    return np.concatenate([focal, middle, lens.distortion[: _N_COEFFICIENTS.get(name)]])
+    return np.concatenate([focal, lens.matrix[:2, 2], lens.distortion[: _N_COEFFICIENTS.get(name)]])
