@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from acino_fte.data_tools.individual_rows import TrackRows, identity, make_rows
 from acino_fte.data_tools.safe_pickle import load_data_pickle
-from acino_fte.data_tools.scene_rows import TrackRows, identity, make_rows
 from acino_fte.data_tools.tracks2d import Tracks2D
 from acino_fte.errors import InputError
 

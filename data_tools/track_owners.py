@@ -34,7 +34,7 @@ def owners(name: str, cameras: Sequence[str]) -> list[str]:
     if found:
         return found
     return cameras_of(name, cameras) or [
-        c for c in cameras if c.isdigit() and re.search(rf"_0*{int(c)}$", _key(name))
+        c for c in cameras if c.isdigit() and re.search(rf"^0*{int(c)}_|_0*{int(c)}$", _key(name))
     ]
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acino_fte.data_tools.scene_rows import TrackRows, joined_tracks, make_rows, places_in_order
+from acino_fte.data_tools.individual_rows import TrackRows, joined_tracks, make_rows, places_in_order
 from acino_fte.data_tools.track_gaps import find_pieces, interpolate_points, name_pieces
 from acino_fte.data_tools.track_table import natural_order
 from acino_fte.data_tools.tracks2d import BARE, CLUTTER, Tracks2D

@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
+from acino_fte.data_tools.individual_rows import TrackRows, clean_rows, joined_tracks, make_rows
+from acino_fte.data_tools.individual_tables import is_empty, names_cameras, read_table_rows, table_kind
 from acino_fte.data_tools.mvt_pickles import read_mvt_pickle
-from acino_fte.data_tools.scene_rows import TrackRows, clean_rows, joined_tracks, make_rows
-from acino_fte.data_tools.scene_tables import is_empty, names_cameras, read_table_rows, table_kind
 from acino_fte.data_tools.track_owners import owner, owners, some
 from acino_fte.data_tools.track_table import matched_columns, read_header
 from acino_fte.data_tools.tracker_exports import exporter, read_idtracker, read_sleap, read_trex
@@ -141,7 +141,7 @@ def _files(path: Path, cameras: Sequence[str]) -> tuple[dict[str, list[Path]], P
             return {}, path
         return {owner(path.stem, cameras, path, [path.name]): [path]}, None
     here = _candidates(path, cameras, "")
-    fitting = {said: file for said, file in here.items() if owners(said, cameras)}
+    fitting = [file for said, file in here.items() if len(owners(said, cameras)) == 1]
     tables = [file for file in here.values() if file.suffix.lower() in _TEXT]
     joint = [file for file in tables if file.name == _MATCHES and names_cameras(file)]
     if not fitting:
@@ -168,7 +168,9 @@ def _candidates(folder: Path, cameras: Sequence[str], above: str) -> dict[str, P
         if item.is_dir():
             if export_files(item):
                 found[above + item.name] = item
-            elif any(name.startswith(f"{above}{item.name}/") for name in cameras):
+            elif owners(above + item.name, cameras) or any(
+                name.startswith(f"{above}{item.name}/") for name in cameras
+            ):
                 found |= _candidates(item, cameras, f"{above}{item.name}/")
         elif item.suffix.lower() in (*TABLES, *_PICKLES) and not NO_TRACKS.fullmatch(item.stem):
             said = above + item.stem

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acino_fte.data_tools.scene_rows import identity
+from acino_fte.data_tools.individual_rows import identity
 from acino_fte.data_tools.track_table import SYNONYMS, _parse, matched_columns, numbers, read_header
 from acino_fte.errors import InputError
 

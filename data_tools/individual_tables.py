@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acino_fte.data_tools.scene_rows import TrackRows, make_rows
+from acino_fte.data_tools.individual_rows import TrackRows, make_rows
 from acino_fte.data_tools.track_table import (
     SYNONYMS,
     _parse,
