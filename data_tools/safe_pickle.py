@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import io
 import pickle
+import re
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from acino_fte.errors import InputError
 
@@ -20,6 +23,8 @@ _BUILTINS = (
     *("set", "slice", "str", "tuple"),
 )
 _MULTIARRAY = ("_reconstruct", "scalar")
+_NUMPY_CORE = re.compile(r"^numpy\.(core|_core)\.")  # NumPy 2 renamed it: files of both are read with both
+_CORE = "numpy._core." if hasattr(np, "_core") else "numpy.core."
 _INDEXES = {"base": "Index", "multi": "MultiIndex", "range": "RangeIndex", "datetimes": "DatetimeIndex"}
 
 ALLOWED: frozenset[tuple[str, str]] = frozenset(
@@ -92,7 +97,7 @@ class _DataUnpickler(pickle.Unpickler):
             return _STAND_INS[name]
         if (module, name) not in ALLOWED:
             raise _Forbidden(f"{module}.{name}")
-        return super().find_class(module, name)
+        return super().find_class(_NUMPY_CORE.sub(_CORE, module), name)
 
     def persistent_load(self, pid: Any) -> Any:
         raise _Forbidden(f"a reference to something outside ({pid!r})")
