@@ -255,7 +255,7 @@ def _rigid(offset: np.ndarray) -> tuple[bool, np.ndarray]:
 
 
 def _length_of_mean(offset: np.ndarray, middle: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Length of the robust mean offset, less its bias; the offsets' parts along it, (K,), and weights (K,)."""
+    """Length of the robust mean offset, less its bias; the offsets' parts along it (K,); weights (K,)."""
     unit = middle / np.linalg.norm(middle)
     along = offset @ unit
     across = offset - along[:, None] * unit

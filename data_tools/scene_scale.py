@@ -279,7 +279,7 @@ def scene_scale(measured: Sequence[tuple[KnownDistance, MeasuredDistance]]) -> S
     InputError
         There is no distance.
     """
-    from scipy.stats import chi2 as chi_square
+    from scipy.special import chdtrc
 
     if not measured:
         raise InputError("The scale needs a known distance.", expected=_EXAMPLE, found="none")
@@ -294,7 +294,7 @@ def scene_scale(measured: Sequence[tuple[KnownDistance, MeasuredDistance]]) -> S
     sd = 1.0 / np.sqrt((1 / variance).sum())
     notes = [note for one in lengths for note in one.notes]
     freedom = len(log) - 1
-    if freedom and chi_square.sf(chi2, freedom) < _P_ODD:
+    if freedom and chdtrc(freedom, chi2) < _P_ODD:
         sd *= np.sqrt(chi2 / freedom)
         notes.append(_odd_one(known, log, variance))
     factor = float(np.exp(mean))

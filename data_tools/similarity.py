@@ -82,3 +82,39 @@ class Similarity:
         return Similarity(
             self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation)
         )
+
+
+def align_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> Similarity:
+    """The similarity of least squares that takes points to points: Umeyama (1991), never a mirror.
+
+    Parameters
+    ----------
+    source, target : (N, 3)
+        The same points in both worlds; rows with NaN in either are left out.
+    with_scale : bool
+        Whether the scale is free; else it is 1.
+
+    Raises
+    ------
+    InputError
+        Fewer than three points, or all of them on one line: the rotation is not determined.
+    """
+    source, target = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
+    if source.shape != target.shape or source.shape[1:] != (3,):
+        raise InputError(
+            "The points to be aligned do not belong together.",
+            expected="two arrays of shape (N, 3)",
+            found=f"{source.shape} and {target.shape}",
+        )
+    both = np.isfinite(source).all(1) & np.isfinite(target).all(1)
+    source, target = source[both], target[both]
+    if len(source) < 3:
+        raise InputError("An alignment needs points.", expected="three or more", found=f"{len(source)}")
+    middle, goal = source.mean(axis=0), target.mean(axis=0)
+    left, value, right = np.linalg.svd((target - goal).T @ (source - middle) / len(source))
+    if not value[1] > 1e-12 * value[0]:
+        raise InputError("The points lie on one line: the rotation about it is not determined.")
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    rotation = (left * sign) @ right
+    scale = float((value * sign).sum() / ((source - middle) ** 2).sum(1).mean()) if with_scale else 1.0
+    return Similarity(scale, rotation, goal - scale * rotation @ middle)
