@@ -144,22 +144,24 @@ def joined_tracks(
     Parameters
     ----------
     parts : sequence of (camera, rows or None, file)
-        Clean rows.
+        Rows with a place, without copies; those without an individual become bare points.
 
     Returns
     -------
     tuple
         Tracks2D for each part, and the names of the individuals that have a row.
     """
-    seen = {rows.names[i] for _, rows, _ in parts if rows is not None for i in np.unique(rows.code)}
+    seen = {
+        rows.names[i] for _, rows, _ in parts if rows is not None for i in np.unique(rows.code) if i != BARE
+    }
     names = tuple(sorted(seen, key=natural_order))
     place = {name: i for i, name in enumerate(names)}
     views = []
     for camera, rows, path in parts:
         if rows is None:
             rows = make_rows(np.zeros(0), np.zeros(0), (), np.zeros((0, 2)))
-        lookup = np.array([place.get(name, BARE) for name in rows.names], dtype=np.int64)
-        track = lookup[rows.code] if len(rows) else rows.code
+        lookup = np.array([*(place.get(name, BARE) for name in rows.names), BARE], dtype=np.int64)
+        track = lookup[rows.code]
         order = np.lexsort((rows.frame, track))
         views.append(
             Tracks2D(
