@@ -1,15 +1,23 @@
 """How well the poses of a model are known, from the residuals of its own observations.
 
-With the points held fixed, a pose is estimated from its image's observations alone. Its covariance is
-σ² (Σ JᵀJ)⁻¹, J the derivatives of the reprojections for the pose and σ² the variance of a residual (Triggs
-et al. 2000, "Bundle adjustment - a modern synthesis", section 9). This is the error that changes from image to
-image; the slow drift of a whole reconstruction is not in it. I images, K observations.
+With the points held fixed, a pose is estimated from the observations of its image alone. Its covariance is
+σ² (Σ JᵀJ)⁻¹, J the derivatives of the reprojections for the pose and σ² the variance of a residual (Triggs et
+al. 2000, "Bundle adjustment - a modern synthesis", section 9). This is the error that changes from image to
+image; the slow drift of a whole reconstruction is not in it.
+
+That holds for poses at the minimum of their residuals, where bundle adjustment leaves them; steps of Gauss
+and Newton, δ = (Σ JᵀJ)⁻¹ Σ Jᵀr, are small there. Where they are larger than chance makes them (a robust loss,
+rounded files), the covariance grows by as much. Poses from elsewhere (another sensor, a filter) are far from
+the minimum, and the steps themselves say how wrong they are: δ ~ N(0, D + σ² (Σ JᵀJ)⁻¹), with one variance of
+turns and one of shifts in D for all images.
+
+Shapes: I images, K observations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +31,10 @@ _MAD_TO_SD = 1.4826
 _GROSS = 4.0  # residuals beyond this many standard deviations count nothing
 _IMAGE_FREEDOMS, _POINT_FREEDOMS, _GAUGE_FREEDOMS = 6, 3, 7
 _SINGULAR = 1e-13
+_MEDIAN_CHI2_6 = 5.348
+_ADJUSTED = 4.0  # steps that take more than this, against chance: the poses are not adjusted
+_GROSS_POSE = 20.0
+_MOST_IMAGES, _EM_STEPS, _EM_TOLERANCE = 1000, 100, 1e-3
 
 
 def residuals(model: ColmapModel) -> np.ndarray:
@@ -40,47 +52,124 @@ def residual_noise(model: ColmapModel, residual: np.ndarray | None = None) -> fl
     gauge, took out of the residuals. NaN where they took out all.
     """
     residual = residuals(model) if residual is None else residual
-    good = np.isfinite(residual).all(axis=1)
-    n = 2 * int(good.sum())
-    n_images = len(np.unique(model.observed_image[good]))
-    n_points = len(np.unique(model.observed_point[good]))
-    taken = _IMAGE_FREEDOMS * n_images + _POINT_FREEDOMS * n_points - _GAUGE_FREEDOMS
+    finite = residual[np.isfinite(residual).all(axis=1)]
+    n, taken = finite.size, _freedoms(model, residual)
     if n == 0 or n <= taken:
         return float("nan")
-    spread = _MAD_TO_SD * float(np.median(np.abs(residual[good])))
-    return spread * float(np.sqrt(n / (n - max(taken, 0))))
+    return _MAD_TO_SD * float(np.median(np.abs(finite))) * float(np.sqrt(n / (n - taken)))
+
+
+def _freedoms(model: ColmapModel, residual: np.ndarray) -> int:
+    """What the poses and points with residuals are free to take out of them, less the gauge."""
+    good = np.isfinite(residual).all(axis=1)
+    n_images = len(np.unique(model.observed_image[good]))
+    n_points = len(np.unique(model.observed_point[good]))
+    return max(_IMAGE_FREEDOMS * n_images + _POINT_FREEDOMS * n_points - _GAUGE_FREEDOMS, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """What the residuals of a model say of its poses.
+
+    Attributes
+    ----------
+    covariance : (I, 6, 6)
+        Turn (rad, in the camera's frame: R_true = exp(turn×) R), then shift of the centre (world, in the
+        model's units), as :class:`~acino_fte.data_tools.camera_keys.KeyedCamera` has it. NaN where the
+        observations do not fix the pose.
+    noise_px : float
+        Standard deviation of an observed coordinate; NaN where the residuals do not say it.
+    adjusted : bool
+        Whether the poses are at the minimum of their residuals.
+    """
+
+    covariance: np.ndarray
+    noise_px: float
+    adjusted: bool
 
 
 def pose_covariances(model: ColmapModel, min_observations: int = MIN_OBSERVATIONS) -> np.ndarray:
-    """Covariance of the pose of each image, (I, 6, 6).
+    """Covariance of the pose of each image, (I, 6, 6): :attr:`PoseErrors.covariance`."""
+    return pose_errors(model, min_observations).covariance
+
+
+def pose_errors(model: ColmapModel, min_observations: int = MIN_OBSERVATIONS) -> PoseErrors:
+    """How wrong the poses of a model are.
 
     Parameters
     ----------
     model : ColmapModel
+        With its observations.
     min_observations : int
-        Images with fewer have a NaN matrix, as have those whose observations do not fix the pose.
+        Images with fewer have a NaN matrix.
 
     Returns
     -------
-    (I, 6, 6)
-        Turn (rad, in the camera's frame: R_true = exp(turn×) R), then shift of the centre (world, in the
-        model's units), as :class:`~acino_fte.data_tools.camera_keys.KeyedCamera` has it.
+    PoseErrors
     """
-    n_images = len(model.names)
     residual = residuals(model)
     sigma = residual_noise(model, residual)
-    normal, count = np.zeros((n_images, 6, 6)), np.zeros(n_images, dtype=int)
+    normal, pull, count, rest = _normal_equations(model, residual, _GROSS * sigma)
+    inverse = _inverses(normal, count >= min_observations)
+    fixed = np.isfinite(inverse).all(axis=(1, 2))
+    step = np.einsum("nij,nj->ni", inverse[fixed], pull[fixed])
+    taken = np.einsum("ni,ni->n", step, pull[fixed])  # of the sum of squares by a step
+    freedoms = 2 * count.sum() - _freedoms(model, residual)
+    if not fixed.any() or not freedoms > 0:
+        return PoseErrors(inverse * np.nan, sigma, adjusted=True)
+    after = (rest - taken.sum()) / freedoms
+    ratio = float(np.median(taken)) / (_MEDIAN_CHI2_6 * after)
+    if ratio < _ADJUSTED:
+        return PoseErrors(inverse * sigma**2 * max(1.0, ratio), sigma, adjusted=True)
+    kept = taken <= _GROSS_POSE * np.median(taken)
+    variances = _common_variances(normal[fixed][kept] / after, pull[fixed][kept] / after)
+    common = np.diag(np.repeat(variances, 3))
+    covariance = np.where(fixed[:, None, None], common, np.nan)
+    return PoseErrors(covariance, float(np.sqrt(after)), adjusted=False)
+
+
+def _normal_equations(
+    model: ColmapModel, residual: np.ndarray, largest: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Σ JᵀJ (I, 6, 6), Σ Jᵀr (I, 6), observations (I,) and Σ r², of residuals up to `largest`."""
+    n_images = len(model.names)
+    normal, pull = np.zeros((n_images, 6, 6)), np.zeros((n_images, 6))
+    count, squares = np.zeros(n_images, dtype=int), 0.0
     for rows, camera, points in _parts(model):
-        image = model.observed_image[rows]
+        image, r = model.observed_image[rows], residual[rows]
         slope = pose_slope(camera, points)
-        good = (np.linalg.norm(residual[rows], axis=1) <= _GROSS * sigma) & np.isfinite(slope).all((1, 2))
-        slope, image = slope[good], image[good]
+        good = (np.linalg.norm(r, axis=1) <= largest) & np.isfinite(slope).all(axis=(1, 2))
+        slope, image, r = slope[good], image[good], r[good]
         if not len(image):
             continue
         starts = np.flatnonzero(np.concatenate([[True], image[1:] != image[:-1]]))
-        normal[image[starts]] += np.add.reduceat(slope.swapaxes(1, 2) @ slope, starts)
+        turned = slope.swapaxes(1, 2)
+        normal[image[starts]] += np.add.reduceat(turned @ slope, starts)
+        pull[image[starts]] += np.add.reduceat((turned @ r[:, :, None])[..., 0], starts)
         count += np.bincount(image, minlength=n_images)
-    return _inverses(normal, count >= min_observations) * sigma**2
+        squares += float(np.sum(r**2))
+    return normal, pull, count, squares
+
+
+def _common_variances(information: np.ndarray, pull: np.ndarray) -> np.ndarray:
+    """Variances (2,) of turns and shifts that make the steps of all images most probable.
+
+    Expectation maximisation: with D = diag(variances), the error of a pose is N(P b, P), P = (D⁻¹ + A)⁻¹,
+    with A (I, 6, 6) and b (I, 6) the normal equations over σ². Images beyond a thousand are skipped evenly.
+    """
+    every = -(-len(pull) // _MOST_IMAGES)
+    information, pull = information[::every], pull[::every]
+    inverse = _inverses(information, np.ones(len(pull), dtype=bool))
+    step = np.einsum("nij,nj->ni", inverse, pull)
+    variances = np.mean(step.reshape(-1, 2, 3) ** 2, axis=(0, 2))
+    for _ in range(_EM_STEPS):
+        posterior = np.linalg.inv(information + np.diag(np.repeat(1.0 / variances, 3)))
+        mean = np.einsum("nij,nj->ni", posterior, pull)
+        second = mean**2 + np.diagonal(posterior, axis1=1, axis2=2)
+        before, variances = variances, np.mean(second.reshape(-1, 2, 3), axis=(0, 2))
+        if np.all(np.abs(variances - before) < _EM_TOLERANCE * before):
+            break
+    return variances
 
 
 def pose_slope(camera: Camera, points: np.ndarray) -> np.ndarray:
