@@ -199,8 +199,8 @@ def _sign(keys: KeyPoses, normal: np.ndarray) -> tuple[int, str, bool, tuple[str
         return int(np.sign(up)), "up as the images have it", True, ()
     if abs(against) >= UPRIGHT:
         note = (
-            "The cameras are taken to look down. Cameras that look straight up, or at a wall along which they "
-            "move, need another source of gravity."
+            "The cameras are taken to look down. Cameras that look straight up, or at a wall along which "
+            "they move, need another source of gravity."
         )
         return int(np.sign(against)), "cameras that look down", False, (note,)
     return 0, "", False, ()
@@ -217,7 +217,7 @@ def _normal(points: np.ndarray, rounds: int = 30) -> np.ndarray:
     normal = np.zeros(3)
     for _ in range(rounds):
         before, normal = normal, np.linalg.eigh((points * weight[:, None]).T @ points)[1][:, 0]
-        if abs(before @ normal) > 1 - 1e-15:
+        if np.linalg.norm(np.cross(before, normal)) < 1e-13 and before.any():
             break
         off = np.abs(points @ normal)
         scale = 1.4826 * float(np.median(off))

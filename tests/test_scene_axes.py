@@ -14,7 +14,7 @@ DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # image-right is x, imag
 
 
 def looking(heading, pitch, roll=0.0) -> np.ndarray:
-    """World-to-camera rotations (K, 3, 3) of cameras with a heading from x, a pitch above the level, a roll."""
+    """World to camera, (K, 3, 3): a heading from x, a pitch above the level, a roll."""
     heading, pitch, roll = np.broadcast_arrays(heading, pitch, roll)
     view = np.stack(
         [np.cos(pitch) * np.cos(heading), np.cos(pitch) * np.sin(heading), np.sin(pitch)], axis=-1
