@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from acino_fte import cli_compare, cli_match, cli_run, cli_simulate, cli_skeleton
+from acino_fte import cli_compare, cli_match, cli_run, cli_scene, cli_simulate, cli_skeleton
 
 app = typer.Typer(
     name="acino-fte",
@@ -16,6 +16,7 @@ app = typer.Typer(
 app.command("run")(cli_run.run)
 app.command("compare")(cli_compare.compare)
 app.command("match")(cli_match.match)
+app.command("scene")(cli_scene.scene)
 app.command("simulate")(cli_simulate.simulate)
 app.add_typer(cli_skeleton.app, name="skeleton")
 

@@ -1,22 +1,24 @@
-"""The report of a matching: one HTML page with everything inside, that opens without a network.
-
-Whatever comes from files (names, warnings) is escaped.
-"""
+"""The report of a matching, a page that opens without a network: numbers, tracks in space, figures."""
 
 from __future__ import annotations
 
-import base64
-import json
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acino_fte.data_tools.match_viewer import SCRIPT, VIEWER
+from acino_fte.data_tools.colours import hex_colours
+from acino_fte.data_tools.page_parts import (
+    cards,
+    figure_list,
+    number,
+    share,
+    table,
+    warning_list,
+    write_page,
+)
 from acino_fte.data_tools.plots_tracks import FIGURES
-from acino_fte.data_tools.plots_tracks_style import colours_of
-from acino_fte.report_page import PAGE, STYLE
+from acino_fte.data_tools.scene_viewer import viewer_html
 from acino_fte.report_scene import ground_grid
 
 if TYPE_CHECKING:
@@ -50,25 +52,20 @@ def write_match_page(
         The page.
     """
     data = viewer_data(matches, points)
-    sections = [_cards(metrics), _list(metrics["warnings"])]
+    sections = [cards(_numbers(metrics)), warning_list(metrics["warnings"])]
     if len(points):
-        sections.append("<h2>In space</h2>" + VIEWER.replace("@grid@", f"{data['grid']['step']:g}"))
-    sections += [_figures(folder / "figures"), _tables(metrics)]
-    fields = {
-        "title": escape(f"{metrics['recording']}: animals matched over {metrics['n_cameras']} cameras"),
-        "style": STYLE,
-        "colour": _colour(metrics),
-        "status": escape(_headline(metrics)),
-        "advice": escape(_advice(metrics)),
-        "body": "\n".join(section for section in sections if section),
-        "data": _script_json(data),
-        "script": SCRIPT,
-    }
-    parts = PAGE.split("@")
-    page = "".join(fields.get(part, f"@{part}@") if i % 2 else part for i, part in enumerate(parts))
-    path = folder / "report.html"
-    path.write_text(page, encoding="utf-8")
-    return path
+        sections.append("<h2>In space</h2>" + viewer_html(f"{data['grid']['step']:g} m"))
+    captions = {name: caption for name, (caption, _) in FIGURES.items()}
+    sections += [figure_list(captions, folder / "figures"), _tables(metrics)]
+    return write_page(
+        folder / "report.html",
+        title=f"{metrics['recording']}: animals matched over {metrics['n_cameras']} cameras",
+        status=_headline(metrics),
+        advice=_advice(metrics),
+        colour=_colour(metrics),
+        sections=sections,
+        data=data,
+    )
 
 
 def viewer_data(matches: TrackMatches, points: SpacePoints) -> dict[str, Any]:
@@ -77,9 +74,8 @@ def viewer_data(matches: TrackMatches, points: SpacePoints) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``tracks`` (group, frames, xyz in m) of every piece of path, thinned when there are very many points;
-        ``colours`` of the groups; ``cameras`` (name, aspect, pose: centre, right, down, forward);
-        ``first`` and ``last`` frame; ``fps``; ``grid``, ``middle`` and ``size`` of the scene, m.
+        As in :mod:`~acino_fte.data_tools.scene_viewer`: a track is a piece of path, thinned when there are
+        very many points; cameras are where they are first.
     """
     recording = matches.recording
     every = max(1, -(-len(points) // _MOST))
@@ -92,8 +88,9 @@ def viewer_data(matches: TrackMatches, points: SpacePoints) -> dict[str, Any]:
         tracks.append(
             {
                 "group": int(points.group[start]),
-                "frames": points.frame[thin].tolist(),
-                "xyz": np.round(points.position[thin], 4).tolist(),
+                "frames": points.frame[thin],
+                "xyz": points.position[thin],
+                "style": "-",
             }
         )
     position = points.position if len(points) else np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
@@ -102,8 +99,10 @@ def viewer_data(matches: TrackMatches, points: SpacePoints) -> dict[str, Any]:
     inside = inside if len(inside) else position
     return {
         "tracks": tracks,
-        "colours": ["#" + "".join(f"{round(255 * v):02x}" for v in c) for c in colours_of(matches.n_groups)],
+        "colours": hex_colours(matches.n_groups),
+        "names": None,
         "cameras": [_camera(camera) for camera in recording.cameras],
+        "cloud": None,
         "first": recording.first_frame,
         "last": recording.first_frame + max(recording.n_frames - 1, 0),
         "fps": recording.fps,
@@ -118,7 +117,12 @@ def _camera(camera: Camera) -> dict[str, Any]:
     rotation = camera.rotation.reshape(-1, 3, 3)[0]
     pose = np.concatenate([np.atleast_2d(camera.centre)[0], rotation.ravel()])
     width, height = camera.resolution
-    return {"name": camera.name, "aspect": round(height / width, 4), "pose": np.round(pose, 5).tolist()}
+    return {
+        "name": camera.name,
+        "aspect": round(height / width, 4),
+        "frames": np.zeros(1, dtype=int),
+        "pose": pose[None],
+    }
 
 
 def _headline(metrics: dict[str, Any]) -> str:
@@ -140,64 +144,31 @@ def _advice(metrics: dict[str, Any]) -> str:
     )
 
 
-def _script_json(value: Any) -> str:
-    """JSON that can stand in a script element: no ``<``, ``>`` or ``&`` as themselves."""
-    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _number(value: float | None, unit: str = "", digits: int = 2) -> str:
-    return "–" if value is None else f"{value:.{digits}f} {unit}".strip()
-
-
-def _share(value: float | None, digits: int = 1) -> str:
-    return "–" if value is None else f"{value:.{digits}%}"
-
-
-def _cards(metrics: dict[str, Any]) -> str:
+def _numbers(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the cards say."""
     cameras = metrics["cameras"].values()
     rows, matched = sum(c["rows"] for c in cameras), sum(c["matched"] for c in cameras)
     begin, end = metrics["frames"]
-    cards = [
+    entries = [
         (str(metrics["n_animals"]), "animals"),
-        (_share(matched / rows if rows else None), f"of {rows:,} dots matched"),
+        (share(matched / rows if rows else None), f"of {rows:,} dots matched"),
         (f"{end - begin:,}", f"frames of {metrics['n_cameras']} cameras"),
-        (_number(metrics["noise_px"]["total"], "px"), "noise of a dot's coordinate"),
-        (_number(metrics["reprojection_px"]["median"], "px"), "median reprojection error"),
-        (_number(metrics["points_3d"]["median_sd_mm"], "mm", 1), "median sd of a position"),
-        (_number(metrics["seconds"]["total"], "s", 1), "in all"),
+        (number(metrics["noise_px"]["total"], "px"), "noise of a dot's coordinate"),
+        (number(metrics["reprojection_px"]["median"], "px"), "median reprojection error"),
+        (number(metrics["points_3d"]["median_sd_mm"], "mm", 1), "median sd of a position"),
+        (number(metrics["seconds"]["total"], "s", 1), "in all"),
     ]
     truth = metrics["truth"]
     if truth is not None:
-        cards += [
-            (_share(truth["pairing_accuracy"], 2), "pairing accuracy (truth)"),
-            (_share(truth["recall"], 2), "recall (truth)"),
+        entries += [
+            (share(truth["pairing_accuracy"], 2), "pairing accuracy (truth)"),
+            (share(truth["recall"], 2), "recall (truth)"),
             (str(truth["identity_switches"]), "identity switches (truth)"),
         ]
         error = truth.get("position_mm", {}).get("right_pairs", {})
         if error.get("count"):
-            cards.append((_number(error["mean"], "mm", 1), "mean distance to the truth"))
-    items = "".join(f'<div class="card"><b>{escape(v)}</b><span>{escape(t)}</span></div>' for v, t in cards)
-    return f'<div class="cards">{items}</div>'
-
-
-def _list(warnings: list[str]) -> str:
-    items = "".join(f"<li>{escape(text)}</li>" for text in warnings)
-    return f'<ul class="warnings">{items}</ul>' if items else ""
-
-
-def _figures(folder: Path) -> str:
-    """The figures that are there, embedded; the PDF beside the page is linked."""
-    shown = []
-    for name, (caption, _) in FIGURES.items():
-        path = folder / f"{name}.png"
-        if path.is_file():
-            image = base64.b64encode(path.read_bytes()).decode("ascii")
-            shown.append(
-                f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{image}">'
-                f'<figcaption>{escape(caption)} (<a href="figures/{name}.pdf">PDF</a>)</figcaption></figure>'
-            )
-    return "<h2>Figures</h2>" + "\n".join(shown) if shown else ""
+            entries.append((number(error["mean"], "mm", 1), "mean distance to the truth"))
+    return entries
 
 
 def _tables(metrics: dict[str, Any]) -> str:
@@ -209,19 +180,13 @@ def _tables(metrics: dict[str, Any]) -> str:
             f"{c['rows']:,}",
             f"{c['tracks']:,}",
             f"{c['matched']:,}",
-            _share(c["matched_share"]),
+            share(c["matched_share"]),
             str(c["animals"]),
-            _number(errors[name]["median"], "px"),
-            _number(errors[name]["p90"], "px"),
+            number(errors[name]["median"], "px"),
+            number(errors[name]["p90"], "px"),
         )
         for name, c in metrics["cameras"].items()
     ]
-    seconds = [(name, _number(value, "s", 3)) for name, value in metrics["seconds"].items()]
-    tables = _table(head, rows) + _table(("step", "time"), seconds)
+    seconds = [(name, number(value, "s", 3)) for name, value in metrics["seconds"].items()]
+    tables = table(head, rows) + table(("step", "time"), seconds)
     return f'<h2>Cameras and time</h2><div class="tables">{tables}</div>'
-
-
-def _table(head: tuple[str, ...], rows: list[Any]) -> str:
-    top = "".join(f"<th>{escape(text)}</th>" for text in head)
-    body = "".join("<tr>" + "".join(f"<td>{escape(v)}</td>" for v in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
