@@ -171,10 +171,11 @@ def smooth_trajectories(
     InputError
         The views do not belong to the cameras, or the noise is not positive.
     """
-    variance = _variances(cameras, views, noise_px)
     camera, place, frame, group, xy = gather_rows(views)
     nodes = make_nodes(group, frame, max_gap, extend)
-    rows = Measurements(cameras, nodes.find(group, frame), camera, frame - first_frame, xy, variance[camera])
+    variance = _variances(cameras, views, noise_px)
+    each = np.concatenate([variance[c][place[camera == c]] for c in range(len(views))])
+    rows = Measurements(cameras, nodes.find(group, frame), camera, frame - first_frame, xy, each)
     points = meeting_points(rows, len(nodes.frame))
     nodes, kept_nodes = take_pieces(nodes, _any(np.isfinite(points[:, 0]), nodes.pieces))
     kept = np.flatnonzero(kept_nodes[rows.node])
@@ -227,8 +228,8 @@ def _collect(
 
 def _variances(
     cameras: CameraArray, views: Sequence[ViewRows], noise_px: float | Sequence[float]
-) -> np.ndarray:
-    """Pixel variance of each view, (C,)."""
+) -> list[np.ndarray]:
+    """Pixel variances of the rows of each view."""
     if len(views) != len(cameras):
         raise InputError(
             "The rows and the cameras do not belong together.",
@@ -238,4 +239,10 @@ def _variances(
     noise = np.broadcast_to(np.asarray(noise_px, dtype=float), (len(cameras),))
     if not ((noise > 0) & np.isfinite(noise)).all():
         raise InputError("The pixel noise is wrong.", key="noise_px", expected="above 0", found=str(noise_px))
-    return noise**2
+    each = [
+        np.full(len(v.frame), sd**2) if v.variance is None else np.asarray(v.variance, dtype=float)
+        for v, sd in zip(views, noise, strict=True)
+    ]
+    if not all((variance > 0).all() for variance in each):
+        raise InputError("The variance of a row is wrong.", key="variance", expected="above 0 everywhere")
+    return each

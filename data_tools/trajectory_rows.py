@@ -26,11 +26,14 @@ class ViewRows:
         Pixels.
     group : (P,) int
         The group (animal) of each row, −1 for none.
+    variance : (P,), optional
+        Of each pixel coordinate, px²; by default that of the view's noise.
     """
 
     frame: np.ndarray
     xy: np.ndarray
     group: np.ndarray
+    variance: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

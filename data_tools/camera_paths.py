@@ -1,0 +1,197 @@
+"""Where a moving camera is in every frame, from its key frames: splines with their uncertainty.
+
+Centres and rotations of the key frames are noisy points on smooth curves. Centres follow
+:mod:`wiener_path` with p = 3. Rotations are unrolled into a curve of three angles, ρ_(k+1) = ρ_k +
+log(R_(k+1) R_kᵀ), which is smoothed like a centre; the difference to the interpolating spline of the same
+angles, which is small, turns SciPy's rotation spline through the key frames. Nothing is made up before
+the first key frame, after the last one, or across long gaps. Shapes: K key frames, N frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from acino_fte.cameras import Camera
+from acino_fte.data_tools.wiener_path import WienerPath, fit_wiener_path
+
+if TYPE_CHECKING:
+    from acino_fte.data_tools.camera_keys import KeyedCamera
+    from acino_fte.data_tools.similarity import Similarity
+
+GAP_STEPS = 6.0
+"""A gap in the key frames is too long from so many of their median steps on."""
+_MISPLACED = 50.0  # squared distance of a key frame from what the others predict, in units of the usual
+
+
+@dataclass(frozen=True, eq=False)
+class PoseNoise:
+    """How far key frames are off: standard deviations of each turn (rad) and each coordinate of a centre."""
+
+    turn: np.ndarray | float
+    shift: np.ndarray | float
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """Poses of a camera, or of a rig's frame, in consecutive frames.
+
+    Attributes
+    ----------
+    name : str
+    frame : (N,) int
+        Consecutive.
+    rotation : (N, 3, 3)
+        World to camera. Where the pose is not known, the nearest known one.
+    translation : (N, 3)
+        World to camera, m.
+    covariance : (N, 6, 6)
+        Turn (rad, in the camera's frame: R_true = exp(turn×) R) and shift of the centre (m, world).
+    known : (N,) bool
+        False in long gaps.
+    key : (N,) bool
+        Frames with a key frame that was used.
+    """
+
+    name: str
+    frame: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    covariance: np.ndarray
+    known: np.ndarray
+    key: np.ndarray
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Positions, (N, 3)."""
+        return -np.einsum("nji,nj->ni", self.rotation, self.translation)
+
+    def rows(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Row of each frame (P,), 0 where there is none, and whether the pose is known there (P,)."""
+        row = np.asarray(frames) - self.frame[0]
+        inside = (row >= 0) & (row < len(self.frame))
+        row = np.where(inside, row, 0)
+        return row, inside & self.known[row]
+
+    def camera(self, lens: Camera) -> Camera:
+        """A moving camera with this path; its row 0 is the path's first frame."""
+        return replace(lens, name=self.name, rotation=self.rotation, translation=self.translation)
+
+    def moved(self, change: Similarity) -> CameraPath:
+        """The same path in another world."""
+        rotation, translation = change.poses(self.rotation, self.translation)
+        covariance = change.pose_covariance(self.covariance)
+        return replace(self, rotation=rotation, translation=translation, covariance=covariance)
+
+
+def camera_path(
+    camera: KeyedCamera,
+    noise: PoseNoise,
+    *,
+    max_gap: float | None = None,
+    frames: tuple[int, int] | None = None,
+) -> CameraPath:
+    """The path of a camera through its key frames.
+
+    Parameters
+    ----------
+    camera : KeyedCamera
+        Its key frames. With a single one it is taken to stand still.
+    noise : PoseNoise
+        Of the key frames, each a number or one a key frame.
+    max_gap : float, optional
+        Frames between key frames beyond which nothing is invented; by default :data:`GAP_STEPS` median
+        steps.
+    frames : (first, last + 1), optional
+        Of a camera that stands still; others have a path from the first to the last key frame.
+
+    Returns
+    -------
+    CameraPath
+        The path. Key frames far from where the others predict them are left out.
+    """
+    turn = np.broadcast_to(np.asarray(noise.turn, dtype=float) ** 2, (len(camera.frame),))
+    shift = np.broadcast_to(np.asarray(noise.shift, dtype=float) ** 2, (len(camera.frame),))
+    if len(camera.frame) == 1:
+        return _standing(camera, float(turn[0]), float(shift[0]), frames)
+    if max_gap is None:
+        max_gap = GAP_STEPS * float(np.median(np.diff(camera.frame)))
+    keep = np.ones(len(camera.frame), dtype=bool)
+    for _ in range(2):  # all key frames, and those that fit together
+        keys = np.flatnonzero(keep)
+        time, rotation = camera.frame[keys], Rotation.from_matrix(camera.rotation[keys])
+        unrolled = unroll(rotation)
+        centres = fit_wiener_path(time, camera.centre[keys], shift[keys], max_gap=max_gap)
+        turns = fit_wiener_path(time, unrolled, turn[keys], max_gap=max_gap)
+        misplaced = _misplaced(centres, camera.centre[keys], shift[keys])
+        misplaced |= _misplaced(turns, unrolled, turn[keys])
+        if not misplaced.any() or (~misplaced).sum() < 4:
+            break
+        keep[keys[misplaced]] = False
+    frame = np.arange(time[0], time[-1] + 1)
+    centre, centre_variance = centres.at(frame)
+    angles, turn_variance = turns.at(frame)
+    known = np.isfinite(centre_variance)
+    nearest = _nearest_known(known)
+    centre, angles = centre[nearest], angles[nearest]
+    matrix = _turned(rotation, time, unrolled, frame[nearest], angles).as_matrix()
+    covariance = np.zeros((len(frame), 6, 6))
+    axis = np.arange(3)
+    covariance[:, axis, axis] = turn_variance[nearest, None]
+    covariance[:, axis + 3, axis + 3] = centre_variance[nearest, None]
+    translation = -np.einsum("nij,nj->ni", matrix, centre)
+    return CameraPath(camera.name, frame, matrix, translation, covariance, known, np.isin(frame, time))
+
+
+def unroll(rotation: Rotation) -> np.ndarray:
+    """The rotations of key frames rolled out into a curve of three angles, (K, 3), rad; the first is 0."""
+    steps = (rotation[1:] * rotation[:-1].inv()).as_rotvec()
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def _turned(
+    rotation: Rotation, time: np.ndarray, unrolled: np.ndarray, frame: np.ndarray, angles: np.ndarray
+) -> Rotation:
+    """The rotation spline through the key frames, turned by what smoothing changed in the angles."""
+    from scipy.interpolate import CubicSpline
+
+    if len(time) < 3:
+        between = RotationSpline(time, rotation)(frame)
+        through = np.stack([np.interp(frame, time, column) for column in unrolled.T], axis=1)
+    else:
+        between, through = RotationSpline(time, rotation)(frame), CubicSpline(time, unrolled)(frame)
+    return Rotation.from_rotvec(angles - through) * between
+
+
+def _misplaced(path: WienerPath, points: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Key frames (K,) far from what the others predict, against how far they usually are."""
+    distance = path.deleted_distance(points, noise)
+    return distance > _MISPLACED * max(float(np.median(distance)), 1.0)
+
+
+def _nearest_known(known: np.ndarray) -> np.ndarray:
+    """Index of the nearest known frame of each frame, (N,)."""
+    index = np.flatnonzero(known)
+    place = np.searchsorted(index, np.arange(len(known)))
+    before, after = index[np.maximum(place - 1, 0)], index[np.minimum(place, len(index) - 1)]
+    every = np.arange(len(known))
+    return np.where(np.abs(every - before) <= np.abs(after - every), before, after)
+
+
+def _standing(camera: KeyedCamera, turn: float, shift: float, frames: tuple[int, int] | None) -> CameraPath:
+    first, stop = frames or (int(camera.frame[0]), int(camera.frame[0]) + 1)
+    frame = np.arange(min(first, camera.frame[0]), max(stop, camera.frame[0] + 1))
+    n = len(frame)
+    covariance = np.broadcast_to(np.diag([turn] * 3 + [shift] * 3), (n, 6, 6)).copy()
+    return CameraPath(
+        camera.name,
+        frame,
+        np.broadcast_to(camera.rotation[0], (n, 3, 3)).copy(),
+        np.broadcast_to(camera.translation[0], (n, 3)).copy(),
+        covariance,
+        np.ones(n, dtype=bool),
+        frame == camera.frame[0],
+    )

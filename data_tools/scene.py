@@ -1,0 +1,347 @@
+"""A scene that moving cameras saw: a model of structure from motion, 2D tracks, and the 3D tracks they give.
+
+    scene = Scene.from_colmap("recording", fps=30).placed(scale=["left-right=0.6"])
+    result = scene.triangulate()
+    result.tracks.position
+
+Nothing is changed in place: every method gives a new scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acino_fte.data_tools.camera_keys import KeyedCamera
+from acino_fte.data_tools.colmap import read_colmap
+from acino_fte.data_tools.colmap_covariance import pose_covariances
+from acino_fte.data_tools.colmap_images import keyed_cameras, parse_image_names
+from acino_fte.data_tools.point_cloud import PointCloud
+from acino_fte.data_tools.scene_paths import RigChoice, ScenePaths, scene_paths
+from acino_fte.data_tools.scene_points import retriangulate, triangulate_points
+from acino_fte.data_tools.scene_result import (
+    SceneResult,
+    single_frames,
+    smooth_tracks,
+    with_single_views,
+)
+from acino_fte.data_tools.scene_rows import SceneRows, scene_rows
+from acino_fte.data_tools.scene_smoothing import smooth_points
+from acino_fte.data_tools.similarity import Similarity
+from acino_fte.data_tools.tracks import PixelOrigin, read_scene_tracks
+from acino_fte.data_tools.tracks2d import Tracks2D
+from acino_fte.errors import InputError
+
+if TYPE_CHECKING:
+    from acino_fte.data_tools.scene_axes import AxesEstimate
+    from acino_fte.data_tools.scene_scale import KnownDistance, ScaleEstimate
+
+_GAP_S, _GAP = 1.0, 30  # longest gap of a track that is filled: seconds, or frames
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Cameras, their key frames, and 2D tracks, in one world.
+
+    Attributes
+    ----------
+    name : str
+    cameras : tuple of KeyedCamera
+        In natural order of their names.
+    tracks : tuple of Tracks2D
+        One for each camera; their labels are the individuals.
+    cloud : PointCloud
+    world_from_model : Similarity
+        From the structure-from-motion model to the world of this scene.
+    scale : ScaleEstimate, optional
+        Where the metres come from; without it lengths are in units of the model.
+    axes : AxesEstimate, optional
+        Where up comes from; without it the axes are those of the model.
+    fps : float, optional
+        Frames per second.
+    warnings : tuple of str
+        What the readers noticed.
+    """
+
+    name: str
+    cameras: tuple[KeyedCamera, ...]
+    tracks: tuple[Tracks2D, ...]
+    cloud: PointCloud
+    world_from_model: Similarity = field(default_factory=Similarity)
+    scale: ScaleEstimate | None = None
+    axes: AxesEstimate | None = None
+    fps: float | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = [camera.name for camera in self.cameras]
+        if [view.camera for view in self.tracks] != names:
+            raise InputError(
+                "The tracks and the cameras do not belong together.",
+                expected=f"tracks of {', '.join(names)}",
+                found=", ".join(view.camera for view in self.tracks) or "none",
+            )
+
+    @classmethod
+    def from_colmap(
+        cls,
+        path: Path | str,
+        tracks: Path | str = "tracks",
+        *,
+        model: Path | str | None = None,
+        pattern: str | None = None,
+        fps: float | None = None,
+        pixel_origin: PixelOrigin = "centre",
+        node: str | None = None,
+        cm_per_pixel: float | None = None,
+        dense: Path | str | None = None,
+    ) -> Scene:
+        """Read a scene from a folder with a COLMAP model and 2D tracks.
+
+        Parameters
+        ----------
+        path : Path
+            The folder. The model is in it or in its ``sparse``.
+        tracks : Path
+            Folder or file of the tracks, in `path` or anywhere.
+        model : Path, optional
+            The model, where it is elsewhere.
+        pattern : str, optional
+            How image names give camera and frame (:func:`colmap_images.parse_image_names`).
+        fps : float, optional
+            Frames per second.
+        pixel_origin : {"centre", "corner"}
+            Which point of the upper left pixel the tracks count from.
+        node : str, optional
+            The node of SLEAP's skeleton that stands for the individual.
+        cm_per_pixel : float, optional
+            TRex's setting.
+        dense : Path, optional
+            A PLY file with a dense cloud, in place of the model's points.
+
+        Raises
+        ------
+        InputError
+            A file is missing, cannot be read, or does not fit the others.
+        """
+        folder = Path(path)
+        if not folder.is_dir():
+            raise InputError(
+                "There is no such folder.",
+                file=folder,
+                expected="a folder with a COLMAP model and 2D tracks",
+                remedy="check the path",
+            )
+        read = read_colmap(folder if model is None else model)
+        images = parse_image_names(read.names, pattern)
+        cameras = keyed_cameras(read, images, pose_covariances(read))
+        place = Path(tracks) if Path(tracks).is_absolute() else folder / tracks
+        place = place if place.exists() else Path(tracks)
+        if not place.exists():
+            raise InputError(
+                "There are no tracks.",
+                file=folder / tracks,
+                expected=f"a folder with a file of tracks for each of {', '.join(c.name for c in cameras)}",
+                remedy="name the folder or file of the tracks (--tracks)",
+            )
+        files = read_scene_tracks(
+            place,
+            [camera.name for camera in cameras],
+            node=node,
+            cm_per_pixel=cm_per_pixel,
+            pixel_origin=pixel_origin,
+        )
+        cloud = read.cloud
+        if dense is not None:
+            from acino_fte.data_tools.point_cloud import read_ply
+
+            cloud = read_ply(dense)
+        return cls(
+            name=folder.resolve().name,
+            cameras=cameras,
+            tracks=files.tracks,
+            cloud=cloud,
+            fps=fps,
+            warnings=(*read.notes, *files.notes),
+        )
+
+    @property
+    def individuals(self) -> tuple[str, ...]:
+        """Names of the individuals."""
+        return tuple(dict.fromkeys(label for view in self.tracks for label in view.labels))
+
+    def moved(self, change: Similarity) -> Scene:
+        """The same scene in another world."""
+        return replace(
+            self,
+            cameras=tuple(camera.moved(change) for camera in self.cameras),
+            cloud=self.cloud.moved(change),
+            world_from_model=change @ self.world_from_model,
+        )
+
+    def placed(self, scale: Sequence[KnownDistance | str] = (), gravity: Path | str = "cameras") -> Scene:
+        """The scene in metres and upright: cameras and cloud alike.
+
+        Parameters
+        ----------
+        scale : sequence of KnownDistance or str
+            Known distances, ``"1-3=0.6"`` or ``"tracks:0-1=0.5"`` (:func:`scene_scale.parse_distance`).
+            Without any, lengths stay in the model's units.
+        gravity : str or Path
+            ``"cameras"``, ``"plane"``, ``"down"``, ``"none"``, or a file of accelerations
+            (:func:`scene_axes.upright`).
+
+        Raises
+        ------
+        InputError
+            A distance names what is not there or cannot be measured, or nothing tells what is up.
+        """
+        from acino_fte.data_tools.scene_axes import metric_upright, upright
+
+        estimate = self._scale(scale) if scale else None
+        axes = upright(self.cameras, gravity=gravity, cloud=self.cloud)
+        change = metric_upright(axes, 1.0 if estimate is None else estimate.factor)
+        notes = (*(estimate.notes if estimate else ()), *axes.notes)
+        return replace(self.moved(change), scale=estimate, axes=axes, warnings=(*self.warnings, *notes))
+
+    def _scale(self, scale: Sequence[KnownDistance | str]) -> ScaleEstimate:
+        from acino_fte.data_tools.scene_scale import measure_distance, parse_distance, resolve, scene_scale
+
+        known = [
+            resolve(parse_distance(one) if isinstance(one, str) else one, self.cameras, self.individuals)
+            for one in scale
+        ]
+        points = None
+        if any(distance.kind == "individuals" for distance in known):
+            points = self.triangulate(smooth=False).points
+        return scene_scale([(one, measure_distance(one, self.cameras, points)) for one in known])
+
+    def camera_paths(self, rig: RigChoice = "auto", max_pose_gap: float | None = None) -> ScenePaths:
+        """The paths of all cameras (:func:`scene_paths.scene_paths`)."""
+        seen = [view.frame for view in self.tracks if len(view)]
+        frames = (min(map(np.min, seen)), max(map(np.max, seen)) + 1) if seen else None
+        return scene_paths(self.cameras, rig=rig, max_gap=max_pose_gap, frames=frames)
+
+    def triangulate(
+        self,
+        rig: RigChoice = "auto",
+        *,
+        smooth: bool = True,
+        max_gap: int | None = None,
+        max_pose_gap: float | None = None,
+        noise_px: float | None = None,
+        tell: Tell | None = None,
+    ) -> SceneResult:
+        """3D tracks of all individuals.
+
+        Parameters
+        ----------
+        rig : "auto", "none", or sequence of sequences of names
+            Which cameras one body carries.
+        smooth : bool
+            Whether the tracks are most probable paths, or points triangulated frame by frame; what one view
+            alone saw comes from the paths either way.
+        max_gap : int, optional
+            Frames without any dot that are filled; by default those of a second, or 30.
+        max_pose_gap : float, optional
+            Frames between key frames beyond which no pose is invented.
+        noise_px : float, optional
+            Standard deviation of a dot's coordinate; by default it is estimated.
+        tell : callable, optional
+            Called with the name of every step.
+
+        Raises
+        ------
+        InputError
+            A rig cannot be made.
+        """
+        tell = tell or (lambda step: None)
+        tell("camera paths")
+        paths = self.camera_paths(rig, max_pose_gap)
+        tell("triangulation")
+        names = self.individuals
+        rows = scene_rows(paths.views, self.tracks, names)
+        fit = triangulate_points(rows, paths.views, noise_px)
+        tracks = points = single_frames(rows, fit, self.tracks, names)
+        if len(points):
+            tell("smoothing")
+            gap = max_gap if max_gap is not None else round(_GAP_S * self.fps) if self.fps else _GAP
+            smoothed = smooth_points(rows, paths.views, fit, gap)
+            fit = retriangulate(rows, paths.views, fit, smoothed.used)
+            points = single_frames(rows, fit, self.tracks, names)
+            tracks = smooth_tracks(rows, smoothed, self.tracks, names)
+            if not smooth:
+                tracks = with_single_views(points, tracks)
+        notes = (*paths.notes, *self._unseen(rows, tracks.individual))
+        numbers = {
+            **self._numbers(paths),
+            "pose_noise_share": {"own": fit.noise.own, "common": fit.noise.common},
+            "warnings": notes,
+        }
+        return SceneResult(self, tracks, points, paths.paths, paths.rigs, fit.noise.px, numbers)
+
+    def _unseen(self, rows: SceneRows, found: np.ndarray) -> list[str]:
+        """Notes on dots and individuals that came to nothing."""
+        notes = []
+        without = sum(len(view) for view in self.tracks) - len(rows.point)
+        if without:
+            notes.append(
+                f"{without} dots have no pose of their camera (before, after or far from its key frames), "
+                "no individual, or lie outside of the lens's valid field; they are not used."
+            )
+        missing = [name for i, name in enumerate(self.individuals) if i not in set(found.tolist())]
+        if missing:
+            listed = ", ".join(missing[:10]) + (", …" if len(missing) > 10 else "")
+            notes.append(f"No two views see these individuals at one time: {listed}. They have no 3D track.")
+        return notes
+
+    def _numbers(self, paths: ScenePaths) -> dict[str, Any]:
+        def noise(one: Any) -> dict[str, float]:
+            return {
+                "turn_sd_deg": float(np.degrees(np.max(one.turn))),
+                "shift_sd_m": float(np.max(one.shift)),
+            }
+
+        return {
+            "pose_noise": {name: noise(one) for name, one in paths.noise.items()},
+            "rigs": [
+                {
+                    "cameras": list(one.names),
+                    "key_frames": len(one.count),
+                    "whiteness": one.whiteness,
+                    "drift_deg": float(np.degrees(one.drift_turn)),
+                    "drift_m": one.drift_shift,
+                    **noise(one.noise),
+                }
+                for one in paths.rigs
+            ],
+            "scale": None if self.scale is None else _scale_numbers(self.scale),
+            "axes": None
+            if self.axes is None
+            else {"how": self.axes.how, "tilt_sd_deg": float(np.degrees(self.axes.tilt_sd))},
+        }
+
+
+def _scale_numbers(scale: ScaleEstimate) -> dict[str, Any]:
+    pairs = zip(scale.distances, scale.measured, scale.residual, scale.normalised, strict=True)
+    return {
+        "factor": scale.factor,
+        "sd": scale.sd,
+        "chi2": scale.chi2,
+        "distances": [
+            {
+                "between": [known.first, known.second],
+                "kind": known.kind,
+                "length_m": known.length,
+                "measured_m": scale.factor * found.length,
+                "residual_m": float(residual),
+                "normalised": float(normalised),
+            }
+            for known, found, residual, normalised in pairs
+        ],
+    }

@@ -1,0 +1,173 @@
+"""How uncertain the points of a scene are: the noise of dots, the errors of poses, and what they make of it.
+
+Base g (:mod:`scene_rows`) knows A_g = Σ JᵀJ/σ² of a point, and errors of its pose move what it sees of the
+point by a random vector with covariance M_g. The point's information is then
+
+    Λ = Σ_g (I + κ A_g M_g)⁻¹ A_g
+
+(Woodbury's identity on σ²I + κ J_g M_g J_gᵀ); for one rig alone Λ⁻¹ = A⁻¹ + M. The share κ of the errors is
+each base's own. The rest, 1 − κ, is common to all: cameras on one vehicle that are not treated as a rig bob
+together between their key frames, which no residual shows, and Λ⁻¹ grows by (1 − κ) M̄.
+
+σ and κ come from the residuals. At the least-squares point the expected sum of squares is
+
+    σ² ν + κ tr(P_⊥ Σ_g J_g M_g J_gᵀ),   P_⊥ = I − J (JᵀJ)⁻¹ Jᵀ,
+
+with ν degrees of freedom; the points differ in both terms, as poses are surer in key frames than between.
+Shapes: P dots, T points, B bases.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from acino_fte.data_tools.scene_rows import SceneRows, Views, pose_shift
+
+NOISE_FLOOR = 0.02
+"""Standard deviation of a dot, px; no detector is better."""
+_BINS, _FEWEST = 10, 20  # groups of points with like errors from poses, and points in one
+_CONTRAST = 1.5  # of the groups' errors from poses, without which the two noises cannot be told apart
+_MOST = 25.0  # κ; poses off by more than five times what is said of them are no poses
+
+
+@dataclass(frozen=True)
+class SceneNoise:
+    """Noise of a scene.
+
+    Attributes
+    ----------
+    px : float
+        Standard deviation of a dot's coordinate.
+    own : float
+        κ, share of the poses' variance that is each base's own; above 1 where the poses are worse than said.
+    """
+
+    px: float
+    own: float = 1.0
+
+    @property
+    def common(self) -> float:
+        """Share of the poses' variance that all bases have in common."""
+        return max(1.0 - self.own, 0.0)
+
+
+class PointInformation:
+    """What dots and poses know of each point, around given positions.
+
+    Parameters
+    ----------
+    rows : SceneRows
+        The dots.
+    views : Views
+        Their cameras.
+    position : (T, 3)
+        Least-squares points; NaN where there is none.
+    used : (P,) bool
+        Dots that count.
+    """
+
+    def __init__(self, rows: SceneRows, views: Views, position: np.ndarray, used: np.ndarray) -> None:
+        self._there = np.flatnonzero(np.isfinite(position[:, 0]))
+        self._position, n = position, rows.n_points
+        place = np.full(n, -1)
+        place[self._there] = np.arange(len(self._there))
+        residual, slope = rows.measured.linearise(position)
+        good = used & np.isfinite(residual).all(1) & (place[rows.point] >= 0)
+        point, j, r = place[rows.point[good]], slope[good], residual[good]
+        base, n_bases, n_there = views.base[rows.camera[good]], len(views.bases), len(self._there)
+        squares = np.concatenate([j, r[..., None]], axis=2)
+        joint = sum_of_each(j.transpose(0, 2, 1) @ squares, base * n_there + point, n_bases * n_there)
+        joint = joint.reshape(n_bases, n_there, 3, 4)
+        self._information, self._gradient = joint[..., :3], joint[..., 3]  # for σ = 1 px
+        self._squared = np.bincount(point, (r**2).sum(1), n_there)
+        self._freedom = 2 * np.bincount(point, minlength=n_there) - 3
+        where, frames = position[self._there], rows.frame[self._there]
+        self._moves = np.stack([pose_shift(path, frames, where) for path in views.bases])
+
+    def estimate_noise(self, px: float | None = None) -> SceneNoise:
+        """σ and κ from the residuals; σ may be given."""
+        free = self._freedom > 0
+        if not free.any():
+            return SceneNoise(px or 1.0)
+        ratio = self._squared[free] / (self._freedom[free] * median_of_chi2(self._freedom[free]))
+        if len(self._moves) == 1:
+            return SceneNoise(px or max(float(np.sqrt(np.median(ratio))), NOISE_FLOOR))
+        from_poses = self._from_poses()[free] / self._freedom[free]
+        typical, level = _in_groups(from_poses, ratio)
+        if px is None and (len(level) < 3 or level.max() < _CONTRAST * level.min()):
+            variance = float(np.median(typical - level))
+            return SceneNoise(np.sqrt(max(variance, NOISE_FLOOR**2)))
+        if px is None:
+            variance, own = _line(level, typical)
+            return SceneNoise(float(np.sqrt(variance)), own)
+        own = float(np.median((typical - px**2) / np.maximum(level, 1e-12)))
+        return SceneNoise(px, float(np.clip(own, 0.0, _MOST)))
+
+    def _from_poses(self) -> np.ndarray:
+        """tr(P_⊥ Σ_g J_g M_g J_gᵀ) of points, px²."""
+        whole = self._information.sum(0)
+        moved = self._information @ self._moves
+        inside = np.linalg.solve(whole, (moved @ self._information).sum(0))
+        out = np.trace(moved.sum(0), axis1=1, axis2=2) - np.trace(inside, axis1=1, axis2=2)
+        return np.maximum(out, 0.0)
+
+    def solve(self, noise: SceneNoise) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (T, 3) and covariances (T, 3, 3) after a step with all errors weighed."""
+        information, gradient = self._information / noise.px**2, self._gradient / noise.px**2
+        if len(self._moves) == 1:
+            inverse = np.linalg.inv(information[0])
+            step, spread = (inverse @ gradient[0][..., None])[..., 0], self._moves[0]
+        else:
+            share = np.linalg.inv(np.eye(3) + noise.own * information @ self._moves)
+            inverse = np.linalg.inv((share @ information).sum(0))
+            step = (inverse @ (share @ gradient[..., None]).sum(0))[..., 0]
+            spread = noise.common * self.mean_shift()
+        position = np.full_like(self._position, np.nan)
+        covariance = np.full((*position.shape, 3), np.nan)
+        position[self._there] = self._position[self._there] + step
+        total = inverse + spread
+        covariance[self._there] = 0.5 * (total + total.transpose(0, 2, 1))
+        return position, covariance
+
+    def mean_shift(self) -> np.ndarray:
+        """M̄, mean over the bases that see each point."""
+        seen = np.trace(self._information, axis1=2, axis2=3) > 0
+        total = np.where(seen[..., None, None], self._moves, 0.0).sum(0)
+        return total / np.maximum(seen.sum(0), 1)[:, None, None]
+
+
+def sum_of_each(values: np.ndarray, index: np.ndarray, n: int) -> np.ndarray:
+    """Sum (n, …) of the values (P, …) of each index (P,)."""
+    flat = values.reshape(len(values), -1)
+    out = np.empty((n, flat.shape[1]))
+    for column in range(flat.shape[1]):
+        out[:, column] = np.bincount(index, flat[:, column], n)
+    return out.reshape(n, *values.shape[1:])
+
+
+def median_of_chi2(freedom: np.ndarray) -> np.ndarray:
+    """Median of χ² over its degrees of freedom (Wilson and Hilferty 1931)."""
+    return (1.0 - 2.0 / (9.0 * freedom)) ** 3
+
+
+def _in_groups(from_poses: np.ndarray, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median of the ratios and of the errors from poses in groups of points with like errors from poses."""
+    n = max(1, min(_BINS, len(ratio) // _FEWEST))
+    groups = np.array_split(np.argsort(from_poses, kind="stable"), n)
+    typical = np.array([np.median(ratio[group]) for group in groups])
+    return typical, np.array([np.median(from_poses[group]) for group in groups])
+
+
+def _line(level: np.ndarray, typical: np.ndarray) -> tuple[float, float]:
+    """σ² and κ of typical = σ² + κ level, both in their ranges; each group weighs by its own variance."""
+    weight = 1.0 / typical
+    columns = np.stack([np.ones_like(level), level], axis=1) * weight[:, None]
+    (variance, own), *_ = np.linalg.lstsq(columns, typical * weight, rcond=None)
+    if own < 0.0:
+        variance, own = float(np.average(typical, weights=weight**2)), 0.0
+    if variance < NOISE_FLOOR**2:
+        variance = NOISE_FLOOR**2
+        own = float(((typical - variance) * level * weight**2).sum() / ((level * weight) ** 2).sum())
+    return float(variance), float(np.clip(own, 0.0, _MOST))

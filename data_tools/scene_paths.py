@@ -1,0 +1,149 @@
+"""The paths of all cameras of a scene: rigs are found and fused, other cameras stand alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from acino_fte.data_tools.camera_keys import KeyedCamera
+from acino_fte.data_tools.camera_paths import CameraPath, PoseNoise, camera_path
+from acino_fte.data_tools.rigs import Rig, find_rigs, fuse_rig
+from acino_fte.data_tools.scene_rows import Views, make_views
+from acino_fte.errors import InputError
+
+RigChoice = str | Sequence[Sequence[str]]
+_TURN_PX, _DISTANCE = 1.0, 100.0  # of poses that nothing is known of: pixels, and shift as a part of distance
+_LONG_DRIFT = 3.0  # a sensor's drift in standard deviations of an image's pose that is worth a word
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePaths:
+    """Paths of the C cameras.
+
+    Attributes
+    ----------
+    paths : tuple of CameraPath
+        One for each camera.
+    rigs : tuple of Rig
+    views : Views
+        The cameras with their paths.
+    noise : dict of str to PoseNoise
+        Of a key frame of each camera.
+    notes : tuple of str
+        What a user should know.
+    """
+
+    paths: tuple[CameraPath, ...]
+    rigs: tuple[Rig, ...]
+    views: Views
+    noise: dict[str, PoseNoise]
+    notes: tuple[str, ...]
+
+
+def scene_paths(
+    cameras: Sequence[KeyedCamera],
+    *,
+    rig: RigChoice = "auto",
+    max_gap: float | None = None,
+    frames: tuple[int, int] | None = None,
+) -> ScenePaths:
+    """The paths of all cameras.
+
+    Parameters
+    ----------
+    cameras : sequence of KeyedCamera
+        Of the scene.
+    rig : "auto", "none", or sequence of sequences of names
+        Which cameras keep their places to each other.
+    max_gap : float, optional
+        Frames between key frames beyond which nothing is invented.
+    frames : (first, last + 1), optional
+        Of cameras that stand still, known from one image.
+
+    Raises
+    ------
+    InputError
+        A rig names cameras that are not there, or cameras that cannot be one.
+    """
+    by_name = {camera.name: camera for camera in cameras}
+    rigs, notes = [], []
+    for names in _chosen(rig, cameras):
+        fused = fuse_rig([by_name[name] for name in names])
+        rigs.append(fused)
+        notes += _drift_notes(fused)
+    paths: dict[str, CameraPath] = {}
+    noise: dict[str, PoseNoise] = {}
+    bases: list[CameraPath] = []
+    base: dict[str, int] = {}
+    for fused in rigs:
+        share = 1.0 / np.sqrt(fused.count)
+        middle = camera_path(
+            fused.keys, PoseNoise(fused.noise.turn * share, fused.noise.shift * share), max_gap=max_gap
+        )
+        for name in fused.names:
+            paths[name], noise[name] = fused.sensor_path(middle, name), fused.noise
+            base[name] = len(bases)
+        bases.append(middle)
+    for camera in cameras:
+        if camera.name in paths:
+            continue
+        noise[camera.name] = pose_noise(camera)
+        paths[camera.name] = camera_path(camera, noise[camera.name], max_gap=max_gap, frames=frames)
+        base[camera.name] = len(bases)
+        bases.append(paths[camera.name])
+        if len(camera.frame) == 1:
+            notes.append(f"Camera '{camera.name}' has one image with a pose: it is taken to stand still.")
+    ordered = tuple(paths[camera.name] for camera in cameras)
+    lenses = [camera.lens for camera in cameras]
+    views = make_views(lenses, ordered, bases, [base[camera.name] for camera in cameras])
+    return ScenePaths(ordered, tuple(rigs), views, noise, tuple(notes))
+
+
+def pose_noise(camera: KeyedCamera) -> PoseNoise:
+    """How far the key frames of a camera are off, from their covariances.
+
+    One number for all key frames, the median: what observations in a single image say of its own pose is
+    itself noisy. Without covariances a pixel's angle, and a hundredth of the way between key frames.
+    """
+    if camera.covariance is not None:
+        traces = np.einsum("kii->ki", camera.covariance)
+        turn, shift = np.sqrt(traces[:, :3].mean(1)), np.sqrt(traces[:, 3:].mean(1))
+        if np.isfinite(turn).any():
+            return PoseNoise(float(np.nanmedian(turn)), float(np.nanmedian(shift)))
+    steps = np.linalg.norm(np.diff(camera.centre, axis=0), axis=1)
+    way = float(np.median(steps)) if len(steps) else float(np.linalg.norm(camera.translation[0]))
+    return PoseNoise(_TURN_PX / camera.lens.matrix[0, 0], max(way / _DISTANCE, 1e-12))
+
+
+def _chosen(rig: RigChoice, cameras: Sequence[KeyedCamera]) -> list[tuple[str, ...]]:
+    """The names of each rig."""
+    if isinstance(rig, str):
+        if rig == "none":
+            return []
+        if rig == "auto":
+            return find_rigs(cameras)
+        rig = [[name.strip() for name in group.split(",")] for group in rig.split(";")]
+    names = [camera.name for camera in cameras]
+    given = [tuple(group) for group in rig]
+    flat = [name for group in given for name in group]
+    strangers = [name for name in flat if name not in names]
+    if strangers or len(set(flat)) != len(flat) or any(len(group) < 2 for group in given):
+        raise InputError(
+            "The rig cannot be made.",
+            key="rig",
+            expected=f"auto, none, or two or more of {', '.join(names)}, each once",
+            found=", ".join(strangers or flat),
+        )
+    return given
+
+
+def _drift_notes(rig: Rig) -> list[str]:
+    turn, shift = float(np.max(rig.noise.turn)), float(np.max(rig.noise.shift))
+    if rig.drift_turn < _LONG_DRIFT * turn and rig.drift_shift < _LONG_DRIFT * shift:
+        return []
+    return [
+        f"The rig of {', '.join(rig.names)} is not rigid: a camera turned by {np.degrees(rig.drift_turn):.2g}°"
+        f" and moved by {rig.drift_shift:.2g} units between the first and the last third of its images."
+    ]

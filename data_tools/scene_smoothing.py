@@ -1,0 +1,166 @@
+"""Most probable paths of the individuals of a scene, from all dots: those of several views and of one alone.
+
+:mod:`trajectories3d` finds the paths for poses that are right. Errors of poses change slowly, over many
+frames, so that smoothing does not average them out: a path follows them as a point would. With the smoothed
+covariance S of pixels alone, A_g what base g knows of the point in its own frame, and N = S⁻¹ − Σ A_g what
+the neighbouring frames know, a shift of what base g sees moves the path by
+
+    K_g = S (A_g + w_g N),
+
+where w_g is the share of base g in the path's dots. So the covariance is S + κ Σ_g K_g M_g K_gᵀ + (1 − κ) M̄
+(:mod:`scene_noise`), and S + M for one rig. Shapes: T nodes of paths, P dots, B bases.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from acino_fte.data_tools.scene_noise import SceneNoise, sum_of_each
+from acino_fte.data_tools.scene_points import PointFit
+from acino_fte.data_tools.scene_rows import SceneRows, Views, pose_shift
+from acino_fte.data_tools.trajectories3d import Trajectories, smooth_trajectories
+from acino_fte.data_tools.trajectory_rows import ViewRows
+
+_BRIDGE = 10  # a path goes on across gaps of so many times the longest gap that is filled
+
+
+@dataclass(frozen=True, eq=False)
+class PathPoints:
+    """Points of smooth paths, sorted by individual, then frame.
+
+    Attributes
+    ----------
+    individual, frame : (T,) int
+    position : (T, 3)
+    covariance : (T, 3, 3)
+    source : (T,) int
+        Index into :data:`scene_tracks.SOURCES`.
+    used : (P,) bool
+        Dots that belong to the paths.
+    """
+
+    individual: np.ndarray
+    frame: np.ndarray
+    position: np.ndarray
+    covariance: np.ndarray
+    source: np.ndarray
+    used: np.ndarray
+
+
+def smooth_points(rows: SceneRows, views: Views, fit: PointFit, max_gap: int) -> PathPoints:
+    """Smooth paths through all dots.
+
+    Parameters
+    ----------
+    rows : SceneRows
+        The dots.
+    views : Views
+        Their cameras.
+    fit : PointFit
+        The points triangulated frame by frame; dots that two others contradict there do not take part.
+    max_gap : int
+        Frames without any dot that are filled.
+
+    Returns
+    -------
+    PathPoints
+        Individuals that no two views ever see have none.
+    """
+    decided = np.bincount(rows.point[fit.used], minlength=rows.n_points)[rows.point] > 0
+    chosen = np.flatnonzero(fit.used | ~decided)
+    variance = _row_variances(rows, views, fit)
+    parts = [chosen[rows.camera[chosen] == c] for c in range(len(views.cameras))]
+    paths = smooth_trajectories(
+        views.cameras,
+        [
+            ViewRows(rows.frame[p], rows.measured.xy[k], rows.individual[p], variance[k])
+            for k, p in ((k, rows.point[k]) for k in parts)
+        ],
+        fit.noise.px,
+        max_gap=_BRIDGE * max_gap,
+        first_frame=views.first_frame,
+    )
+    used = np.zeros(len(rows.point), dtype=bool)
+    for k, wrong, distance in zip(parts, paths.wrong, paths.distance, strict=True):
+        used[k] = ~wrong & np.isfinite(distance)
+    node = paths.find(rows.individual, rows.frame)[rows.point]
+    used &= node >= 0
+    covariance = _with_poses(rows, views, fit.noise, paths, node, used, variance)
+    keep = ~_too_long(paths, max_gap)
+    return PathPoints(
+        paths.group[keep], paths.frame[keep], paths.position[keep], covariance[keep], paths.source[keep], used
+    )
+
+
+def _row_variances(rows: SceneRows, views: Views, fit: PointFit) -> np.ndarray:
+    """Variance of each dot's coordinates (P,), px²: its own, and of bases that err apart that of the pose."""
+    variance = np.full(len(rows.point), fit.noise.px**2)
+    if len(views.bases) == 1:
+        return variance
+    typical = np.full(len(rows.point), np.nan)
+    position = fit.position[rows.point]
+    there = np.isfinite(position[:, 0])
+    _, slope = rows.measured.linearise(fit.position)
+    for b, path in enumerate(views.bases):
+        mine = there & (views.base[rows.camera] == b)
+        moves = pose_shift(path, rows.frame[rows.point[mine]], position[mine])
+        spread = slope[mine] @ moves @ slope[mine].transpose(0, 2, 1)
+        typical[mine] = 0.5 * np.trace(spread, axis1=1, axis2=2)
+    known = np.isfinite(typical)
+    if known.any():
+        typical[~known] = np.median(typical[known])
+        variance += fit.noise.own * typical
+    return variance
+
+
+def _with_poses(
+    rows: SceneRows,
+    views: Views,
+    noise: SceneNoise,
+    paths: Trajectories,
+    node: np.ndarray,
+    used: np.ndarray,
+    variance: np.ndarray,
+) -> np.ndarray:
+    """Covariances (T, 3, 3) of the paths with the errors of the poses."""
+    moves = np.stack([pose_shift(path, paths.frame, paths.position) for path in views.bases])
+    if len(moves) == 1:
+        return paths.covariance + moves[0]
+    n, n_bases = len(paths), len(moves)
+    chosen = np.flatnonzero(used)
+    measured = rows.measured.subset(chosen, node[chosen])
+    _, slope = measured.linearise(paths.position)
+    good = np.isfinite(slope).all((1, 2))
+    slope, chosen = slope[good], chosen[good]
+    base = views.base[rows.camera[chosen]]
+    squares = slope.transpose(0, 2, 1) @ slope / variance[chosen, None, None]
+    own = sum_of_each(squares, base * n + node[chosen], n_bases * n).reshape(n_bases, n, 3, 3)
+    inverse = np.linalg.inv(paths.covariance)
+    beside = inverse - own.sum(0)
+    share = np.bincount(
+        paths.group[node[chosen]] * n_bases + base, minlength=n_bases * (paths.group.max() + 1)
+    )
+    share = share.reshape(-1, n_bases)[paths.group]
+    share = share / np.maximum(share.sum(1), 1)[:, None]
+    white = noise.px**2 / float(np.mean(variance[chosen])) if len(chosen) else 1.0
+    total = white * paths.covariance
+    for b in range(n_bases):
+        gain = paths.covariance @ (own[b] + share[:, b, None, None] * beside)
+        total = total + noise.own * gain @ moves[b] @ gain.transpose(0, 2, 1)
+    mean = np.einsum("tb,btij->tij", share, moves)
+    return total + noise.common * mean
+
+
+def _too_long(paths: Trajectories, max_gap: int) -> np.ndarray:
+    """Nodes (T,) in runs without a dot that are longer than what is filled."""
+    empty = paths.source >= 2
+    index = np.flatnonzero(empty)
+    run = np.cumsum(np.diff(index, prepend=-2) > 1)
+    breaks = np.zeros(len(empty), dtype=bool)
+    if len(index):
+        same = np.diff(paths.piece[index], prepend=paths.piece[index[0]]) == 0
+        run = run + np.cumsum(~same)
+        breaks[index] = np.bincount(run)[run] > max_gap
+    return breaks
