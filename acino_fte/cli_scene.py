@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -45,13 +45,14 @@ def scene(
         ),
     ] = None,
     tracks: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="NAME|PATH",
             help="Folder of the 2D tracks, in FOLDER or anywhere.",
             rich_help_panel=_INPUT,
+            show_default="tracks",
         ),
-    ] = "tracks",
+    ] = None,
     model: Annotated[
         Path | None,
         typer.Option(
@@ -104,14 +105,15 @@ def scene(
         ),
     ] = None,
     rig: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="auto|none|NAME,NAME,…",
             help="Cameras that one body carries: found by themselves, none, or these (apart with semicolons "
             "for several bodies). A rig's path is better than that of each camera.",
             rich_help_panel=_CAMERAS,
+            show_default="auto",
         ),
-    ] = "auto",
+    ] = None,
     max_pose_gap: Annotated[
         str | None,
         typer.Option(
@@ -136,14 +138,15 @@ def scene(
         ),
     ] = None,
     gravity: Annotated[
-        str,
+        str | None,
         typer.Option(
-            metavar="cameras|plane|none|FILE",
-            help="What is up: the cameras' paths and images, a plane through the cloud, nothing, or the "
-            "accelerometer in a CSV file.",
+            metavar="cameras|plane|down|none|FILE",
+            help="What says where up is: the cameras' paths and images, a plane through the cloud, cameras "
+            "that look down, nothing, or a camera's accelerometer in a CSV file.",
             rich_help_panel=_WORLD,
+            show_default="cameras",
         ),
-    ] = "cameras",
+    ] = None,
     smooth: Annotated[
         bool,
         typer.Option(
@@ -207,14 +210,14 @@ def scene(
             cm_per_pixel=_positive("--cm-per-pixel", cm_per_pixel),
             dense=dense,
             rig=_rig(rig),
-            max_pose_gap=_gap("--max-pose-gap", max_pose_gap, fps),
+            max_pose_gap=max_pose_gap,
             time_offsets=time_offsets,
-            scale=tuple(scale or ()),
+            scale=tuple(scale) if scale else None,
             gravity=gravity,
             smooth=smooth,
-            max_gap=_gap("--max-gap", max_gap, fps),
+            max_gap=max_gap,
             noise_px=_positive("--noise-px", noise_px),
-        )
+        ).completed(folder)
         artist: Any = False
         if figures:
             from acino_fte.data_tools.scene_drawing import FigureProcess
@@ -236,7 +239,7 @@ def scene(
         metrics = save_scene(
             result,
             target,
-            options=given.record(),
+            options=asdict(given),
             truth=true,
             seconds=clock.seconds,
             formats=kinds,
@@ -261,9 +264,9 @@ def scene(
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What the user asked for. Gaps are in frames; None leaves the choice to the data."""
+    """What the user asked for, on the command line and in ``scene.yaml``."""
 
-    tracks: str
+    tracks: str | None
     model: Path | None
     pattern: str | None
     fps: float | None
@@ -272,24 +275,48 @@ class SceneOptions:
     cm_per_pixel: float | None
     dense: Path | None
     rig: Any
-    max_pose_gap: int | None
+    max_pose_gap: str | None
     time_offsets: bool
-    scale: tuple[str, ...]
-    gravity: str
+    scale: tuple[str, ...] | None
+    gravity: str | None
     smooth: bool
-    max_gap: int | None
+    max_gap: str | None
     noise_px: float | None
 
-    def record(self) -> dict[str, Any]:
-        """For ``metrics.json``."""
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+    def completed(self, folder: Path) -> SceneOptions:
+        """With what the recording's ``scene.yaml`` says, where the command line says nothing."""
+        from acino_fte.data_tools.scene_settings import read_scene_settings
+
+        said = asdict(read_scene_settings(folder))
+        usual = {"tracks": "tracks", "rig": "auto", "gravity": "cameras", "scale": ()}
+        mine = asdict(self)
+        first: dict[str, Any] = {
+            key: next((v for v in (mine[key], said[key], usual.get(key)) if v is not None), None)
+            for key in said
+        }
+        return replace(self, **first)
 
 
 def _triangulated(folder: Path, given: SceneOptions, tell: Callable[[str], None]) -> SceneResult:
     """The scene of a folder, triangulated; the one place that knows how :class:`Scene` is called."""
     from acino_fte.data_tools.scene import Scene
 
-    raise NotImplementedError(Scene)
+    gaps = {"max_gap": _gap("--max-gap", given.max_gap, given.fps)}
+    gaps["max_pose_gap"] = _gap("--max-pose-gap", given.max_pose_gap, given.fps)
+    found = Scene.from_colmap(
+        folder,
+        given.tracks or "tracks",
+        model=given.model,
+        pattern=given.pattern,
+        fps=given.fps,
+        pixel_origin="corner" if given.pixel_origin == "corner" else "centre",
+        node=given.node,
+        cm_per_pixel=given.cm_per_pixel,
+        dense=given.dense,
+    )
+    tell("scale and axes")
+    found = found.placed(scale=given.scale or (), gravity=given.gravity or "cameras")
+    return found.triangulate(given.rig, smooth=given.smooth, noise_px=given.noise_px, tell=tell, **gaps)
 
 
 def _truth(path: Path | None) -> Any:
@@ -324,8 +351,10 @@ def _formats(text: str) -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in names)
 
 
-def _rig(text: str) -> Any:
-    """``auto``, ``none``, or the names of the cameras of each rig."""
+def _rig(text: str | None) -> Any:
+    """``auto``, ``none``, or the names of the cameras of each rig; None for no word."""
+    if text is None:
+        return None
     if text.strip().lower() in ("auto", "none"):
         return text.strip().lower()
     rigs = tuple(
