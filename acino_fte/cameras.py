@@ -7,23 +7,17 @@ Shapes: N frames, C cameras, M markers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 
+from acino_fte import camera_field
 from acino_fte.errors import InputError
-from acino_fte.projection import COEFFICIENTS, programs
+from acino_fte.projection import CLOSED, COEFFICIENTS, INTRINSICS
 
-_GRID = 2000
-_NEWTON_STEPS = 12
-_COUNTS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (4,)}
-
-
-@cache
-def _compiled(model: str) -> dict[str, Callable[..., None]]:
-    return {name: program.numpy_function for name, program in programs(model).items()}
+_COUNTS = {model: (len(names),) for model, names in COEFFICIENTS.items()} | {"pinhole": (0, 4, 5, 8, 12)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +28,12 @@ class Camera:
     ----------
     name : str
     model : str
-        ``"pinhole"`` or ``"fisheye"``.
+        ``"pinhole"``, ``"fisheye"``, or another of :data:`acino_fte.projection.COEFFICIENTS`.
     matrix : (3, 3)
-        Camera matrix, px; no skew.
-    distortion : (0 | 4 | 5 | 8 | 12,) or (4,) for fisheye
-        OpenCV's coefficients in OpenCV's order.
+        Camera matrix, px; no skew. Of a panorama (``equirectangular``): px/rad.
+    distortion : (K,)
+        Coefficients in the order of :data:`acino_fte.projection.COEFFICIENTS`, OpenCV's: all of them, but
+        0, 4, 5, 8 or 12 for pinhole.
     rotation : (3, 3) or (N, 3, 3)
         World to camera, one for all frames or one a frame.
     translation : (3,) or (N, 3)
@@ -84,10 +79,12 @@ class Camera:
         padded[: len(self.distortion)] = self.distortion
         return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *padded])
 
-    @property
+    @cached_property
     def centre(self) -> np.ndarray:
         """Position of the camera in the world, (3,) or (N, 3), m."""
-        return -np.einsum("...ji,...j->...i", self.rotation, self.translation)
+        centre = -np.einsum("...ji,...j->...i", self.rotation, self.translation)
+        centre.setflags(write=False)
+        return centre
 
     def at_frames(self, frames: slice | np.ndarray) -> Camera:
         """The camera for a range of frames; a fixed camera is returned as it is."""
@@ -115,7 +112,7 @@ class Camera:
         return np.einsum("nij,nmj->nmi", rotation, points) + translation[:, None]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels (…, 2) of world points (…, 3); NaN behind the camera."""
+        """Pixels (…, 2) of world points (…, 3); NaN where it cannot see: behind it, for most models."""
         local = self.to_camera(np.asarray(points, dtype=float))
         return np.moveaxis(self._run("project", local, 2), 0, -1)
 
@@ -123,77 +120,83 @@ class Camera:
         """Pixels (…, 2) and their derivative for the world point (…, 2, 3), px/m."""
         local = self.to_camera(np.asarray(points, dtype=float))
         out = self._run("jacobian", local, 8)
-        pixels = np.moveaxis(out[:2], 0, -1)
-        slope = np.moveaxis(out[2:].reshape(2, 3, *local.shape[:-1]), (0, 1), (-2, -1))
-        rotation = self.rotation[:, None] if self.rotation.ndim == 3 else self.rotation
-        return pixels, slope @ rotation
+        slope = out[2:].reshape(2, 3, *local.shape[:-1])
+        if self.rotation.ndim == 3:
+            turn = np.ascontiguousarray(self.rotation.transpose(1, 2, 0))[
+                ..., None
+            ]  # vectors over the frames
+            world = np.empty_like(slope)
+            for i in range(2):
+                for k in range(3):
+                    world[i, k] = (
+                        slope[i, 0] * turn[0, k] + slope[i, 1] * turn[1, k] + slope[i, 2] * turn[2, k]
+                    )
+        else:
+            world = (self.rotation.T @ slope.reshape(2, 3, -1)).reshape(slope.shape)
+        return np.moveaxis(out[:2], 0, -1), np.moveaxis(world, (0, 1), (-2, -1))
 
     def _run(self, program: str, local: np.ndarray, n_out: int) -> np.ndarray:
-        """Run a program on camera-frame points; points with z ≤ 0 give NaN."""
-        x, y, z = np.moveaxis(local, -1, 0)
-        z = np.where(z > 0, z, np.nan)
-        out = np.empty((n_out, *z.shape))
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            _compiled(self.model)[program]([x, y, z, *self.parameters], out)
-        out[:, np.isnan(z)] = np.nan  # results that do not depend on z
+        """Run a program on camera-frame points (…, 3); those that the camera cannot see give NaN."""
+        x, y, z = np.ascontiguousarray(np.moveaxis(local, -1, 0))
+        out = camera_field.run(self.model, program, (x, y, z), self.parameters, n_out)
+        seen = camera_field.seen(self.model, self.parameters[len(INTRINSICS) :], x, y, z)
+        if not seen.all():
+            out[:, ~seen] = np.nan
         return out
 
-    @cached_property
-    def _radial_table(self) -> tuple[np.ndarray, np.ndarray]:
-        """Angle from the axis against distorted radius, as far as the radius grows (the valid field)."""
-        angle = np.linspace(0.0, np.radians(89.9), _GRID)
-        if self.model == "fisheye":
-            bent = angle * np.polyval([*self.distortion[::-1], 1.0], angle**2)
-        else:
-            k = self.parameters[4:]
-            r = np.tan(angle)
-            with np.errstate(divide="ignore"):
-                bent = r * np.polyval([k[4], k[1], k[0], 1], r**2) / np.polyval([k[7], k[6], k[5], 1], r**2)
-        folds = np.flatnonzero(~(np.diff(bent) > 0))
-        end = folds[0] + 1 if len(folds) else _GRID
-        return angle[:end], bent[:end]
+    @property
+    def _field(self) -> camera_field.Field:
+        """The valid field of a lens whose inverse is no formula."""
+        return camera_field.field(self.model, tuple(self.parameters[len(INTRINSICS) :].tolist()))
 
     @property
     def valid_angle(self) -> float:
         """Angle from the optical axis up to which the distortion is one-to-one, rad."""
-        return float(self._radial_table[0][-1])
+        if self.model in CLOSED:
+            return camera_field.closed_angle(self.model, self.parameters[len(INTRINSICS) :])
+        return self._field.angle
+
+    def _distorted(self, pixels: np.ndarray) -> np.ndarray:
+        """Distorted normalised coordinates (2, K) of pixels (…, 2)."""
+        fx, fy, cx, cy = self.parameters[:4]
+        u, v = np.asarray(pixels, dtype=float).reshape(-1, 2).T
+        return np.stack([(u - cx) / fx, (v - cy) / fy])
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
-        """Ideal normalised coordinates (…, 2) of pixels (…, 2); NaN outside the valid field.
+        """Ideal normalised coordinates (…, 2), X/Z and Y/Z, of pixels (…, 2).
 
-        Solves ``distort(a, b) = pixel`` by Newton's method from an inverted radial table.
+        NaN outside the valid field, and 90° or more from the axis, where only :meth:`directions` reach.
         """
-        fx, fy, cx, cy = self.parameters[:4]
-        pixels = np.asarray(pixels, dtype=float)
-        target = np.stack([(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy])
-        angle_of, bent = self._radial_table
-        radius = np.hypot(target[0], target[1])
-        target = np.where(radius < 1.2 * bent[-1], target, np.nan)  # hopelessly far outside
-        angle = np.interp(radius, bent, angle_of)
-        guess = target * np.tan(angle) / np.where(radius > 0, radius, 1.0)
-        distort = _compiled(self.model)["distort"]
-        out = np.empty((6, *radius.shape))
-        with np.errstate(all="ignore"):
-            for _ in range(_NEWTON_STEPS):
-                distort([guess[0], guess[1], *self.parameters], out)
-                e0, e1 = target[0] - out[0], target[1] - out[1]
-                if not np.nanmax(np.abs(e0) + np.abs(e1), initial=0.0) > 1e-13:
-                    break
-                determinant = out[2] * out[5] - out[3] * out[4]
-                guess = guess + np.stack([out[5] * e0 - out[3] * e1, out[2] * e1 - out[4] * e0]) / determinant
-            distort([guess[0], guess[1], *self.parameters], out)
-            missed = np.hypot(out[0] - target[0], out[1] - target[1]) * fx
-            outside = np.arctan(np.hypot(guess[0], guess[1])) > self.valid_angle + 1e-9
-        return np.moveaxis(np.where((missed < 1e-7) & ~outside, guess, np.nan), 0, -1)
+        if self.model in CLOSED:
+            x, y, z = np.moveaxis(self.directions(pixels), -1, 0)
+            z = np.where(z > 0, z, np.nan)
+            return np.stack([x / z, y / z], axis=-1)
+        chart = self._field.solve(self._distorted(pixels))
+        return camera_field.normalised(self.model, chart).T.reshape(np.shape(pixels))
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit directions (…, 3) in the camera's frame of pixels (…, 2); NaN outside the valid field."""
+        if self.model in CLOSED:
+            local = camera_field.closed_directions(self.model, self.parameters, self._distorted(pixels))
+            return local.T.reshape(*np.shape(pixels)[:-1], 3)
+        a, b = np.moveaxis(self.undistort(pixels), -1, 0)
+        z = 1.0 / np.sqrt(a**2 + b**2 + 1.0)
+        return np.stack([a * z, b * z, z], axis=-1)
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Unit directions in the world (N, M, 3) of pixels (N, M, 2), from the camera's centre."""
-        normalised = self.undistort(pixels)
-        local = np.concatenate([normalised, np.ones((*normalised.shape[:-1], 1))], axis=-1)
-        local /= np.linalg.norm(local, axis=-1, keepdims=True)
+        local = self.directions(pixels)
         if self.rotation.ndim == 3:
             return np.einsum("nji,nmj->nmi", self.rotation, local)
         return local @ self.rotation
+
+    def pixel_difference(self, pixels: np.ndarray, from_pixels: np.ndarray) -> np.ndarray:
+        """``pixels − from_pixels`` (…, 2), px; across the seam of a panorama the short way round."""
+        difference = np.subtract(pixels, from_pixels)
+        if self.model == "equirectangular":
+            around = 2.0 * np.pi * self.matrix[0, 0]
+            difference[..., 0] -= around * np.round(difference[..., 0] / around)
+        return difference
 
     def back_project(self, pixels: np.ndarray, depth: np.ndarray | float) -> np.ndarray:
         """World points (N, M, 3) at a depth (z in the camera's frame, m) behind pixels (N, M, 2)."""
@@ -226,7 +229,7 @@ def _check_camera(camera: Camera) -> None:
         )
 
     if camera.model not in COEFFICIENTS:
-        fail("model", "'pinhole' or 'fisheye'", repr(camera.model))
+        fail("model", " or ".join(map(repr, COEFFICIENTS)), repr(camera.model))
     if camera.matrix.shape != (3, 3):
         fail("camera matrix", "shape (3, 3)", f"shape {camera.matrix.shape}")
     if camera.distortion.size not in _COUNTS[camera.model]:
@@ -243,13 +246,12 @@ def _check_camera(camera: Camera) -> None:
     for key in ("matrix", "distortion", "rotation", "translation"):
         if not np.all(np.isfinite(getattr(camera, key))):
             fail(key, "finite numbers", "NaN or infinity")
-    gram = camera.rotation @ np.swapaxes(camera.rotation, -1, -2)
-    error = float(np.max(np.abs(gram - np.eye(3))))
-    if error > 1e-3 or np.any(np.linalg.det(camera.rotation) < 0):
+    error, determinant = _no_rotation(camera.rotation)
+    if error > 1e-3 or determinant < 0:
         fail(
             "rotation",
             "an orthonormal matrix with determinant +1 (world to camera)",
-            f"|R·Rᵀ − 1| = {error:.2g}, determinant {np.min(np.linalg.det(camera.rotation)):+.3f}",
+            f"|R·Rᵀ − 1| = {error:.2g}, determinant {determinant:+.3f}",
             "the file may hold a rotation vector, a transposed 4×4 matrix, or a mirrored frame",
         )
     k = camera.matrix
@@ -265,6 +267,30 @@ def _check_camera(camera: Camera) -> None:
         )
     if abs(k[0, 1]) > 1e-6 * k[0, 0]:
         fail("camera matrix", "no skew: [0][1] is 0", f"{k[0, 1]:g}", "calibrate without skew")
+    values = dict(zip(COEFFICIENTS[camera.model], camera.distortion.tolist(), strict=False))
+    if camera.model == "fov" and not abs(values["omega"]) < np.pi:
+        fail("distortion", "ω of a fov camera between −π and π, rad", f"{values['omega']:g}")
+    if camera.model == "eucm" and not (0 <= values["alpha"] <= 1 and values["beta"] > 0):
+        found = f"α = {values['alpha']:g}, β = {values['beta']:g}"
+        fail("distortion", "0 ≤ α ≤ 1 and β > 0 of an eucm camera", found)
+
+
+def _no_rotation(rotation: np.ndarray) -> tuple[float, float]:
+    """Largest |R·Rᵀ − 1| and least determinant of rotations (…, 3, 3), by vectors over all of them."""
+    r = np.ascontiguousarray(np.moveaxis(rotation.reshape(-1, 3, 3), 0, -1))
+    if r.shape[-1] == 0:
+        return 0.0, 1.0
+    error = 0.0
+    for i in range(3):
+        for j in range(i, 3):
+            dot = r[i, 0] * r[j, 0] + r[i, 1] * r[j, 1] + r[i, 2] * r[j, 2]
+            error = max(error, float(np.max(np.abs(dot - (i == j)))))
+    determinant = (
+        r[0, 0] * (r[1, 1] * r[2, 2] - r[1, 2] * r[2, 1])
+        + r[0, 1] * (r[1, 2] * r[2, 0] - r[1, 0] * r[2, 2])
+        + r[0, 2] * (r[1, 0] * r[2, 1] - r[1, 1] * r[2, 0])
+    )
+    return error, float(np.min(determinant))
 
 
 @dataclass(frozen=True, eq=False)
