@@ -144,6 +144,6 @@ def _drift_notes(rig: Rig) -> list[str]:
     if rig.drift_turn < _LONG_DRIFT * turn and rig.drift_shift < _LONG_DRIFT * shift:
         return []
     return [
-        f"The rig of {', '.join(rig.names)} is not rigid: a camera turned by {np.degrees(rig.drift_turn):.2g}°"
+        f"The rig of {', '.join(rig.names)} is not rigid: one turned by {np.degrees(rig.drift_turn):.2g}°"
         f" and moved by {rig.drift_shift:.2g} units between the first and the last third of its images."
     ]

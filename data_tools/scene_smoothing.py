@@ -2,12 +2,12 @@
 
 :mod:`trajectories3d` finds the paths for poses that are right. Errors of poses change slowly, over many
 frames, so that smoothing does not average them out: a path follows them as a point would. With the smoothed
-covariance S of pixels alone, A_g what base g knows of the point in its own frame, and N = S⁻¹ − Σ A_g what
-the neighbouring frames know, a shift of what base g sees moves the path by
+covariance S of pixels alone, A_g what base g knows of the point in its own frame, and Ā_g the mean of that
+over the neighbouring frames, a shift of what base g sees moves the path by
 
-    K_g = S (A_g + w_g N),
+    K_g = S A_g + (I − S Σ A_g) (Σ Ā_g)⁻¹ Ā_g
 
-where w_g is the share of base g in the path's dots. So the covariance is S + κ Σ_g K_g M_g K_gᵀ + (1 − κ) M̄
+(the frame's own part, and that of its neighbours). So the covariance is S + κ Σ_g K_g M_g K_gᵀ + (1 − κ) M̄
 (:mod:`scene_noise`), and S + M for one rig. Shapes: T nodes of paths, P dots, B bases.
 """
 
@@ -23,6 +23,7 @@ from acino_fte.data_tools.scene_rows import SceneRows, Views, pose_shift
 from acino_fte.data_tools.trajectories3d import Trajectories, smooth_trajectories
 from acino_fte.data_tools.trajectory_rows import ViewRows
 
+_AROUND, _FIRM = 15, 1e-9  # frames on both sides that count as neighbours; keeps their sum invertible
 _BRIDGE = 10  # a path goes on across gaps of so many times the longest gap that is filled
 
 
@@ -137,20 +138,29 @@ def _with_poses(
     base = views.base[rows.camera[chosen]]
     squares = slope.transpose(0, 2, 1) @ slope / variance[chosen, None, None]
     own = sum_of_each(squares, base * n + node[chosen], n_bases * n).reshape(n_bases, n, 3, 3)
-    inverse = np.linalg.inv(paths.covariance)
-    beside = inverse - own.sum(0)
-    share = np.bincount(
-        paths.group[node[chosen]] * n_bases + base, minlength=n_bases * (paths.group.max() + 1)
-    )
-    share = share.reshape(-1, n_bases)[paths.group]
-    share = share / np.maximum(share.sum(1), 1)[:, None]
     white = noise.px**2 / float(np.mean(variance[chosen])) if len(chosen) else 1.0
     total = white * paths.covariance
+    around = np.stack([_moving_mean(each, paths.piece) for each in own])
+    level = np.trace(around.sum(0), axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    whole = np.linalg.inv(around.sum(0) + _FIRM * level + 1e-300 * np.eye(3))
+    beside = np.eye(3) - paths.covariance @ own.sum(0)
     for b in range(n_bases):
-        gain = paths.covariance @ (own[b] + share[:, b, None, None] * beside)
+        gain = paths.covariance @ own[b] + beside @ whole @ around[b]
         total = total + noise.own * gain @ moves[b] @ gain.transpose(0, 2, 1)
-    mean = np.einsum("tb,btij->tij", share, moves)
+    seen = np.trace(around, axis1=2, axis2=3) > 0
+    mean = (seen[..., None, None] * moves).sum(0) / np.maximum(seen.sum(0), 1)[:, None, None]
     return total + noise.common * mean
+
+
+def _moving_mean(values: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """Mean of values (T, 3, 3) over the neighbouring nodes of the same piece."""
+    n = len(values)
+    total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(values, axis=0)])
+    index = np.arange(n)
+    begin = np.searchsorted(piece, piece, side="left")
+    end = np.searchsorted(piece, piece, side="right")
+    low, high = np.maximum(index - _AROUND, begin), np.minimum(index + _AROUND + 1, end)
+    return (total[high] - total[low]) / (high - low)[:, None, None]
 
 
 def _too_long(paths: Trajectories, max_gap: int) -> np.ndarray:
