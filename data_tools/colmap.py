@@ -14,20 +14,21 @@ import numpy as np
 
 from acino_fte.cameras import Camera
 from acino_fte.data_tools.colmap_binary import (
+    RawImages,
     check_frames,
     check_rigs,
     not_whole,
     read_images,
     read_points,
 )
+from acino_fte.data_tools.colmap_cameras import camera_from_colmap
+from acino_fte.data_tools.colmap_folders import find_model, model_ending
 from acino_fte.data_tools.point_cloud import PointCloud
 from acino_fte.errors import InputError
 
 HALF_PIXEL = 0.5
 """COLMAP has the centre of the first pixel at (0.5, 0.5), this project at (0, 0)."""
 
-_FILES = ("cameras", "images", "points3D")
-_PLACES = (".", "sparse", "colmap/sparse", "sfm", "dense/sparse")
 _QUATERNION_ERROR = 1e-3
 
 
@@ -120,8 +121,8 @@ def read_colmap(path: Path | str) -> ColmapModel:
         There is no model, it is broken, or it has no image with a pose; the message names the file and the
         remedy. Also when pycolmap is not installed.
     """
-    folder, notes = _find_model(Path(path))
-    ending = _ending(folder)
+    folder, notes = find_model(Path(path))
+    ending = model_ending(folder)
     if ending == "bin":
         for name, check in (("rigs.bin", check_rigs), ("frames.bin", check_frames)):
             if (folder / name).is_file():
@@ -139,9 +140,7 @@ def read_colmap(path: Path | str) -> ColmapModel:
     rotation, translation = _poses([image.cam_from_world() for image in posed], folder / f"images.{ending}")
     points = points[np.argsort(points["id"])]
     cloud = _cloud(points, folder / f"points3D.{ending}")
-    rows = {image_id: row for row, image_id in enumerate(images.ids.tolist())}
-    observations = [images.observations[rows[image_id]] for image_id in order]
-    seen = _observations(observations, points["id"], notes)
+    seen = _observations(images, order, points["id"], notes)
     return ColmapModel(
         path=folder,
         cameras=_cameras(model, {image.camera_id for image in posed}, folder / f"cameras.{ending}"),
@@ -159,82 +158,6 @@ def read_colmap(path: Path | str) -> ColmapModel:
         frame_ids=np.array([image.frame_id for image in posed], dtype=np.int64),
         notes=tuple(notes),
     )
-
-
-def _ending(folder: Path) -> str | None:
-    """``bin`` or ``txt`` of a folder with a whole model (binary first, as COLMAP has it), else None."""
-    for ending in ("bin", "txt"):
-        if all((folder / f"{name}.{ending}").is_file() for name in _FILES):
-            return ending
-    return None
-
-
-def _find_model(path: Path) -> tuple[Path, list[str]]:
-    """The folder of the model, and what to note about the choice."""
-    if not path.is_dir():
-        found = "a file" if path.exists() else "nothing"
-        raise InputError(
-            "There is no such COLMAP model.",
-            file=path,
-            expected="a folder",
-            found=found,
-            remedy="check the path",
-        )
-    for place in _PLACES:
-        base = path / place
-        if _ending(base):
-            return base, []
-        if base.is_dir():
-            numbered = [p for p in base.iterdir() if p.name.isdigit() and _ending(p)]
-            if numbered:
-                return _largest(sorted(numbered, key=lambda p: int(p.name)))
-    _refuse_part(path)
-    raise InputError(
-        "The folder holds no COLMAP model.",
-        file=path,
-        expected="cameras, images and points3D (.bin or .txt), here or in sparse, sparse/0, …",
-        found=", ".join(sorted(p.name for p in path.iterdir())[:12]) or "an empty folder",
-        remedy="give the folder of the model, or export it: `colmap model_converter --output_type BIN`",
-    )
-
-
-def _refuse_part(path: Path) -> None:
-    """Raise when there is a model of which a file is missing."""
-    for place in _PLACES:
-        for ending in ("bin", "txt"):
-            missing = [f"{n}.{ending}" for n in _FILES if not (path / place / f"{n}.{ending}").is_file()]
-            if len(missing) < len(_FILES):
-                raise InputError(
-                    "A file of the COLMAP model is missing.",
-                    file=path / place,
-                    expected=", ".join(f"{name}.{ending}" for name in _FILES),
-                    found=f"no {', no '.join(missing)}",
-                    remedy="copy the whole folder of the model",
-                )
-
-
-def _largest(folders: list[Path]) -> tuple[Path, list[str]]:
-    """The model with most images, the first of equals."""
-    if len(folders) == 1:
-        return folders[0], []
-    counts = [_count_images(folder) for folder in folders]
-    best = int(np.argmax(counts))
-    others = ", ".join(
-        f"{f.name} ({n})" for i, (f, n) in enumerate(zip(folders, counts, strict=True)) if i != best
-    )
-    note = (
-        f"Of {len(folders)} models, {folders[best]} is read, which has most images ({counts[best]}); "
-        f"left out: {others}."
-    )
-    return folders[best], [note]
-
-
-def _count_images(folder: Path) -> int:
-    if _ending(folder) == "bin":
-        with (folder / "images.bin").open("rb") as file:
-            return int.from_bytes(file.read(8), "little")
-    with (folder / "images.txt").open("rb") as file:
-        return sum(1 for line in file if not line.startswith(b"#")) // 2
 
 
 @contextmanager
@@ -280,7 +203,16 @@ def _check_size(path: Path, model: Any) -> None:
 def _posed_images(model: Any, file: Path, notes: list[str]) -> tuple[list[int], list[Any]]:
     """Ids and objects of the images with a pose, sorted by name; names are checked."""
     images = list(model.images.items())
-    posed = sorted(((i, image) for i, image in images if image.has_pose), key=lambda pair: pair[1].name)
+    try:
+        posed = sorted(((i, image) for i, image in images if image.has_pose), key=lambda pair: pair[1].name)
+    except UnicodeDecodeError as error:
+        raise InputError(
+            "The name of an image is not text.",
+            file=file,
+            expected="UTF-8",
+            found=repr(error.object),
+            remedy="rename the image, or copy the model again",
+        ) from error
     if not posed:
         raise InputError(
             "No image of the COLMAP model has a pose.",
@@ -306,7 +238,8 @@ def _poses(rigid: list[Any], file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Rotations (I, 3, 3) and translations (I, 3) of pycolmap's rigid motions; the quaternions are normed."""
     quaternion = np.array([each.rotation.quat for each in rigid], dtype=float).reshape(-1, 4)
     translation = np.array([each.translation for each in rigid], dtype=float).reshape(-1, 3)
-    norm = np.linalg.norm(quaternion, axis=1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(quaternion, axis=1)
     wrong = ~(np.abs(norm - 1) < _QUATERNION_ERROR) | ~np.isfinite(translation).all(axis=1)
     if wrong.any():
         raise InputError(
@@ -345,20 +278,17 @@ def _cloud(points: np.ndarray, file: Path) -> PointCloud:
 
 
 def _observations(
-    observations: list[np.ndarray], point_ids: np.ndarray, notes: list[str]
+    images: RawImages, image_ids: list[int], point_ids: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Image (K,), point (K,) and pixel (K, 2) of all observations whose point is in the model."""
-    counts = [len(rows) for rows in observations]
-    rows = np.concatenate(observations)
-    image = np.repeat(np.arange(len(counts)), counts)
-    point = np.minimum(np.searchsorted(point_ids, rows["point"]), max(len(point_ids) - 1, 0))
-    known = point_ids[point] == rows["point"] if len(point_ids) else np.zeros(len(rows), dtype=bool)
-    xy = rows["xy"] - HALF_PIXEL
+    image, xy, ids = images.of_images(image_ids)
+    point = np.minimum(np.searchsorted(point_ids, ids), max(len(point_ids) - 1, 0))
+    known = point_ids[point] == ids if len(point_ids) else np.zeros(len(ids), dtype=bool)
     if not known.all():
-        lost = len(rows) - int(known.sum())
-        notes.append(f"{lost} of {len(rows)} observations are of points that points3D lacks: left out.")
+        lost = len(ids) - int(known.sum())
+        notes.append(f"{lost} of {len(ids)} observations are of points that points3D lacks: left out.")
     known &= np.isfinite(xy).all(axis=1)
-    return image[known], point[known], xy[known]
+    return image[known], point[known], xy[known] - HALF_PIXEL
 
 
 def _cameras(model: Any, used: set[int], file: Path) -> dict[int, Camera]:
@@ -374,27 +304,18 @@ def _cameras(model: Any, used: set[int], file: Path) -> dict[int, Camera]:
                 found=f"{camera.width} × {camera.height} px, {', '.join(f'{p:g}' for p in camera.params)}",
                 remedy="run the reconstruction again, or mend the camera",
             )
-        cameras[camera_id] = _camera_from_colmap(camera, f"camera {camera_id}")
+        try:
+            cameras[camera_id] = camera_from_colmap(camera, f"camera {camera_id}")
+        except InputError as error:
+            raise InputError(
+                error.problem,
+                file=file,
+                key=error.key,
+                expected=error.expected,
+                found=error.found,
+                remedy=error.remedy,
+            ) from error
     return cameras
-
-
-def _camera_from_colmap(camera: Any, name: str) -> Camera:
-    """Stand-in until the lens models land."""
-    p = np.asarray(camera.params, dtype=float)
-    model, distortion = "pinhole", np.zeros(4)
-    kind = camera.model.name
-    if kind in ("SIMPLE_RADIAL", "SIMPLE_PINHOLE"):
-        distortion[: len(p) - 3] = p[3:]
-        p = p[[0, 0, 1, 2]]
-    elif kind in ("OPENCV", "OPENCV_FISHEYE", "PINHOLE"):
-        distortion[: len(p) - 4] = p[4:]
-        model = "fisheye" if kind == "OPENCV_FISHEYE" else "pinhole"
-    else:
-        raise InputError(f"The camera model {kind} is not known.", key=name)
-    matrix = np.array([[p[0], 0, p[2] - HALF_PIXEL], [0, p[1], p[3] - HALF_PIXEL], [0, 0, 1]])
-    return Camera(
-        name, model, matrix, distortion, np.eye(3), np.zeros(3), (int(camera.width), int(camera.height))
-    )
 
 
 def _declared_rigs(model: Any, folder: Path) -> tuple[DeclaredRig, ...]:
@@ -410,7 +331,7 @@ def _declared_rigs(model: Any, folder: Path) -> tuple[DeclaredRig, ...]:
                 continue
             turn, shift = np.full((3, 3), np.nan), np.full(3, np.nan)
             if pose is not None:
-                turn, shift = (part[0] for part in _poses([pose], folder / f"rigs.{_ending(folder)}"))
+                turn, shift = (part[0] for part in _poses([pose], folder / f"rigs.{model_ending(folder)}"))
             camera_ids.append(sensor.id)
             rotation.append(turn)
             translation.append(shift)

@@ -24,9 +24,8 @@ _REFERENCE, _POSE, _DATUM = 8, 56, 16  # bytes of a rig's first sensor, of a pos
 _RAW_POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
-_RAW_OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 _TRACK_ELEMENT = 8
-NO_POINT = 2**64 - 1
+NO_POINT = np.uint64(2**64 - 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +35,20 @@ class RawImages:
     Attributes
     ----------
     ids : (I,) int
-    observations : tuple of structured arrays
-        For each image, its points of the model: ``xy`` (px, COLMAP's corner) and ``point`` (id).
+    observations : tuple of (K_i, 3) uint64
+        For each image, its points of the model: the bits of x and y (px, double; COLMAP's pixel centres), id.
     """
 
     ids: np.ndarray
     observations: tuple[np.ndarray, ...]
+
+    def of_images(self, image_ids: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Place in `image_ids` (K,), pixel (K, 2) and id of the point (K,) of all their observations."""
+        row = {image_id: i for i, image_id in enumerate(self.ids.tolist())}
+        parts = [self.observations[row[image_id]] for image_id in image_ids]
+        rows = np.concatenate(parts)
+        image = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        return image, np.ascontiguousarray(rows[:, :2]).view("<f8"), rows[:, 2]
 
 
 def read_images(path: Path) -> RawImages:
@@ -50,24 +57,19 @@ def read_images(path: Path) -> RawImages:
     Raises
     ------
     InputError
-        The file is not whole, or a pose has a number that is not finite.
+        The file is not whole.
     """
     data = path.read_bytes()
     ids, observations = [], []
     try:
         at = _COUNT.size
         for _ in range(_COUNT.unpack_from(data)[0]):
-            image_id, *pose, _camera = _IMAGE.unpack_from(data, at)
-            end = data.index(b"\0", at + _IMAGE.size)
-            name = data[at + _IMAGE.size : end]
-            (n,) = _COUNT.unpack_from(data, end + 1)
-            at = end + 1 + _COUNT.size
-            rows = np.frombuffer(data, _RAW_OBSERVATION, n, at)
-            at += rows.nbytes
-            if not np.isfinite(pose).all():
-                raise _bad_pose(path, name.decode(errors="replace"))
-            ids.append(image_id)
-            observations.append(rows[rows["point"] != NO_POINT])
+            ids.append(_IMAGE.unpack_from(data, at)[0])
+            at = data.index(b"\0", at + _IMAGE.size) + 1
+            (n,) = _COUNT.unpack_from(data, at)
+            rows = np.frombuffer(data, "<u8", 3 * n, at + _COUNT.size).reshape(n, 3)
+            at += _COUNT.size + rows.nbytes
+            observations.append(rows[rows[:, 2] != NO_POINT])
     except (struct.error, ValueError, OverflowError) as error:
         raise not_whole(path) from error
     if at != len(data):
@@ -91,7 +93,7 @@ def read_points(path: Path) -> np.ndarray:
         for _ in range(_COUNT.unpack_from(data)[0]):
             offsets.append(at)
             at += _POINT.size + _TRACK_ELEMENT * _COUNT.unpack_from(data, at + length_at)[0]
-    except struct.error as error:
+    except (struct.error, OverflowError) as error:
         raise not_whole(path) from error
     if at != len(data):
         raise not_whole(path)
@@ -114,7 +116,7 @@ def check_rigs(path: Path) -> None:
             at += _RIG.size + (_REFERENCE if n_sensors else 0)
             for _ in range(n_sensors - 1):
                 at += _SENSOR.size + (_POSE if _SENSOR.unpack_from(data, at)[2] else 0)
-    except struct.error as error:
+    except (struct.error, OverflowError) as error:
         raise not_whole(path) from error
     if at != len(data):
         raise not_whole(path)
@@ -127,7 +129,7 @@ def check_frames(path: Path) -> None:
         at = _COUNT.size
         for _ in range(_COUNT.unpack_from(data)[0]):
             at += _FRAME.size + _DATUM * _FRAME.unpack_from(data, at)[-1]
-    except struct.error as error:
+    except (struct.error, OverflowError) as error:
         raise not_whole(path) from error
     if at != len(data):
         raise not_whole(path)
@@ -141,14 +143,4 @@ def not_whole(path: Path) -> InputError:
         expected="records as COLMAP writes them, up to the last byte",
         found=f"{path.stat().st_size:,} bytes that do not fit them",
         remedy="copy the model again, or export it again with `colmap model_converter`",
-    )
-
-
-def _bad_pose(path: Path, name: str) -> InputError:
-    return InputError(
-        f"The pose of image '{name}' is not finite.",
-        file=path,
-        expected="finite numbers",
-        found="NaN or infinity",
-        remedy="run the reconstruction again, or delete the image from the model",
     )

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from acino_fte.cameras import Camera
 from acino_fte.data_tools.colmap import HALF_PIXEL
+from acino_fte.data_tools.colmap_cameras import colmap_parameters
 from acino_fte.errors import InputError
 
-ColmapCamera = tuple[str, int, int, Sequence[float]]
-"""Model, width, height, parameters."""
+ColmapCamera = Camera | tuple[str, int, int, Sequence[float]]
+"""A lens, or COLMAP's model, width, height and parameters."""
 
 _ONE_FOCAL = {
     "SIMPLE_PINHOLE",
@@ -50,9 +52,9 @@ def write_colmap_text(
     ----------
     folder : Path
         Is made when it is not there; the three files are replaced.
-    cameras : mapping of int to (model, width, height, parameters)
-        COLMAP's id → COLMAP's model and its parameters in COLMAP's order, but the principal point with pixel
-        centres at integers: the half pixel is added here.
+    cameras : mapping of int to Camera or (model, width, height, parameters)
+        COLMAP's id → the lens (its pose counts nothing); or COLMAP's model and its parameters in COLMAP's
+        order, but the principal point with pixel centres at integers: the half pixel is added here.
     names : sequence of str (I,)
         Of the images.
     camera_ids : (I,) int
@@ -111,13 +113,23 @@ def _camera_lines(cameras: Mapping[int, ColmapCamera]) -> Iterator[str]:
     yield "# Camera list with one line of data per camera:"
     yield "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
     yield f"# Number of cameras: {len(cameras)}"
-    for camera_id, (model, width, height, given) in sorted(cameras.items()):
-        parameters = np.array(given, dtype=float)
-        _finite(f"camera {camera_id}", parameters)
-        if model != "EQUIRECTANGULAR":  # it has no principal point
-            first = 1 if model in _ONE_FOCAL else 2
-            parameters[first : first + 2] += HALF_PIXEL
-        yield f"{camera_id} {model} {width} {height} {_numbers(parameters.tolist())}"
+    for camera_id, camera in sorted(cameras.items()):
+        if isinstance(camera, Camera):
+            (width, height), (model, parameters) = camera.resolution, colmap_parameters(camera)
+        else:
+            model, width, height, given = camera
+            parameters = _with_half_pixel(model, given)
+        _finite(f"camera {camera_id}", np.array(parameters))
+        yield f"{camera_id} {model} {width} {height} {_numbers(parameters)}"
+
+
+def _with_half_pixel(model: str, parameters: Sequence[float]) -> list[float]:
+    """Parameters with COLMAP's principal point; a panorama has none."""
+    values = [float(value) for value in parameters]
+    first = 1 if model in _ONE_FOCAL else 2
+    if model != "EQUIRECTANGULAR":
+        values[first : first + 2] = [value + HALF_PIXEL for value in values[first : first + 2]]
+    return values
 
 
 def _image_lines(
