@@ -146,12 +146,13 @@ class Field:
         angle = np.interp(radius, self.start_bent, self.start_angle)
         start = bent * (_radius(self.model, angle) / np.where(radius > 0, radius, 1.0))
         near = radius <= self.reach  # False for NaN
+        bent = np.where(near, bent, np.nan)
         with np.errstate(all="ignore"):
             guess, good = self._newton(start, bent)
             again = np.flatnonzero(near & ~good)
             if len(again):
                 guess[:, again], good[again] = self._damped(start[:, again], bent[:, again])
-        return np.where(good & near, guess, np.nan)
+        return np.where(good, guess, np.nan)
 
     def _newton(self, guess: np.ndarray, bent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Newton's steps for all; which of them (K,) have met their target in the field."""
@@ -166,7 +167,8 @@ class Field:
                 break
             guess = guess + _newton_step(out, error, determinant)
             if worst < _LAST and np.nanmin(determinant, initial=1.0) > _STEEP:
-                break  # the last step squares the error: there is nothing left to see
+                missed = missed**2  # of this last step; NaN stays
+                break
         return guess, (missed < _CLOSE) & (determinant > 0) & self.contains(guess)
 
     def _damped(self, guess: np.ndarray, bent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -241,6 +241,44 @@ def test_a_moving_camera_is_a_fixed_camera_in_every_frame(model, what):
     assert np.allclose(cut.project(world[1:4]), pixels[1:4], equal_nan=True)
 
 
+def test_many_poses_are_as_one_by_one():
+    """More than one block of the programs, and a pose for each point."""
+    n = 10_000
+    rng = np.random.default_rng(5)
+    rotation = Rotation.from_rotvec(rng.normal(0, 1, (n, 3))).as_matrix()
+    local = np.concatenate([rng.uniform(-0.6, 0.6, (n, 2)), np.ones((n, 1))], axis=1)
+    local *= rng.uniform(1, 9, (n, 1))
+    fixed = Camera("c", "pinhole", matrix(), PINHOLE, np.eye(3), np.zeros(3), (WIDTH, HEIGHT))
+    translation = rng.normal(0, 1, (n, 3))
+    moving = replace(fixed, rotation=rotation, translation=translation)
+    world = np.einsum("nji,nj->ni", rotation, local - translation)
+    pixels, jacobian = moving.project_with_jacobian(world[:, None])
+    for start in range(0, n, 1999):
+        part = slice(start, start + 50)
+        expected, slope = fixed.project_with_jacobian(local[part])
+        assert np.allclose(pixels[part, 0], expected, rtol=1e-11, atol=1e-8)
+        assert np.allclose(jacobian[part, 0], slope @ rotation[part], rtol=1e-9, atol=1e-7)
+    way = world - moving.centre
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    assert np.allclose(moving.rays(pixels)[:, 0], way, atol=1e-9)
+    assert np.array_equal(moving.at_frames(np.array([7, 3])).centre, moving.centre[[7, 3]])
+
+
+@pytest.mark.parametrize("fault", ["mirrored", "scaled"])
+def test_one_bad_rotation_among_many(fault):
+    rotation = np.stack([np.eye(3)] * 1000)
+    rotation[617] = SWAPPED if fault == "mirrored" else 1.002 * np.eye(3)
+    with pytest.raises(InputError, match="its rotation is wrong"):
+        replace(cameras_about()[0], rotation=rotation)
+
+
+def test_a_camera_without_frames():
+    camera = replace(cameras_about()[0], rotation=np.zeros((0, 3, 3)), translation=np.zeros((0, 3)))
+    pixels, jacobian = camera.project_with_jacobian(np.zeros((0, 4, 3)))
+    assert (pixels.shape, jacobian.shape) == ((0, 4, 2), (0, 4, 2, 3))
+    assert camera.rays(pixels).shape == (0, 4, 3)
+
+
 def test_fixed_cameras_are_the_same_at_all_frames():
     camera = cameras_about()[0]
     assert camera.at_frames(slice(0, 2)) is camera
@@ -264,8 +302,9 @@ def test_camera_array():
 
 def test_cameras_cannot_be_changed():
     camera = cameras_about()[0]
-    with pytest.raises(ValueError, match="read-only"):
-        camera.rotation[0, 0] = 2.0
+    for values in (camera.rotation[0], camera.centre):
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 2.0
 
 
 def test_two_cameras_with_one_name():
