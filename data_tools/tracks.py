@@ -26,6 +26,7 @@ from acino_fte.errors import InputError
 PixelOrigin = Literal["centre", "corner"]
 _PICKLES, _TEXT = (".pkl", ".pickle"), (".csv", ".tsv", ".txt")
 _MATCHES = "observations.csv"
+_DEEPEST = 4  # folders in folders
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +169,9 @@ def _candidates(folder: Path, cameras: Sequence[str], above: str) -> dict[str, P
         if item.is_dir():
             if export_files(item):
                 found[above + item.name] = item
-            elif owners(above + item.name, cameras) or any(
-                name.startswith(f"{above}{item.name}/") for name in cameras
+            elif above.count("/") < _DEEPEST and (
+                owners(above + item.name, cameras)
+                or any(name.startswith(f"{above}{item.name}/") for name in cameras)
             ):
                 found |= _candidates(item, cameras, f"{above}{item.name}/")
         elif item.suffix.lower() in (*TABLES, *_PICKLES) and not NO_TRACKS.fullmatch(item.stem):

@@ -150,6 +150,20 @@ def test_a_pickle_that_would_run_code_is_refused_and_runs_nothing(tmp_path):
     assert not ran.exists()
 
 
+@pytest.mark.parametrize(
+    ("part", "broken"),
+    [(b"latin1", b"nolat1"), (b"X\x01\0\0\0bq", b"X\x01\0\0\0,q"), (b"i8", b"??"), (b"bs.", b"b")],
+)
+def test_broken_pickles_are_one_clear_message(tmp_path, part, broken):
+    """What NumPy ends with depends on where: LookupError, SyntaxError, TypeError, EOFError."""
+    whole = pickle.dumps({"IDENTITIES": np.arange(2)}, 2)
+    assert part in whole
+    (tmp_path / "left.pkl").write_bytes(whole.replace(part, broken))
+    error = message(read_scene_tracks, tmp_path, NAMES)
+    assert "broken" in error.problem
+    assert error.file.endswith("left.pkl")
+
+
 @needs(RIG)
 @pytest.mark.parametrize("name", ["tracks", "tracks_outlier"])
 def test_the_pickles_of_multiviewtracks(name):
