@@ -79,7 +79,9 @@ def read_ply(path: Path | str) -> PointCloud:
     try:
         xyz = np.stack([vertices[axis].astype(float) for axis in "xyz"], axis=1)
     except (TypeError, ValueError) as error:
-        raise InputError("The positions are not numbers.", file=path, found=str(error)) from error
+        raise InputError(
+            "The positions are not numbers.", file=path, expected="one number each", found=str(error)
+        ) from error
     rgb = _colours(vertices, names)
     finite = np.isfinite(xyz).all(axis=1)
     if not finite.any():
