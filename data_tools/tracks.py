@@ -181,10 +181,14 @@ def _candidates(folder: Path, cameras: Sequence[str], above: str) -> dict[str, P
 
 
 def _has_tracks(path: Path) -> bool:
-    """Whether a file is meant to hold tracks, by its kind and its header."""
-    if path.suffix.lower() not in _TEXT:
+    """Whether a file is meant to hold 2D tracks, by its kind and its header."""
+    if path.is_dir() or path.suffix.lower() in _PICKLES:
         return True
-    return not is_empty(path) and (table_kind(path) is not None or exporter(path) is not None)
+    if path.suffix.lower() not in _TEXT:
+        return exporter(path) is not None
+    if is_empty(path) or "z" in matched_columns(read_header(path)[0]):
+        return False
+    return table_kind(path) is not None or exporter(path) is not None
 
 
 def _camera_rows(paths: list[Path], camera: str, options: _Options, notes: list[str]) -> TrackRows:

@@ -370,6 +370,15 @@ def test_pickles_of_something_else(tmp_path, data, said):
     assert error.file.endswith("left.pkl")
 
 
+@needs(SHARED / "sleap_mouse")
+def test_files_of_a_real_recording_that_are_no_tracks_are_passed_over():
+    result = read_scene_tracks(SHARED / "sleap_mouse", ["top", "side", "mid", "back"], node="Nose")
+    assert [view.path.name for view in result.tracks] == [
+        f"{view.camera}.analysis.h5" for view in result.tracks
+    ]
+    assert all(map(len, result.tracks))
+
+
 # ------------------------------------------------------------ names of cameras
 
 
@@ -421,6 +430,8 @@ def test_a_file_that_fits_no_camera(tmp_path):
         assert [view.camera for view in with_it.tracks] == list(NAMES)
         path.unlink()
     write(tmp_path / "notes.csv", "date,weather\n1,fine\n")  # no tracks: none of our business
+    write(tmp_path / "points.csv", "frame,id,x,y,z\n0,0,1,2,3\n")  # in space
+    np.savez(tmp_path / "x_posture.npz", a=np.ones(3))
     write(tmp_path / "left_truth.csv", "animal\n1\n")
     write(tmp_path / "README.md", "tracks")
     check(tmp_path)
