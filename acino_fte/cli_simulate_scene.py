@@ -55,6 +55,9 @@ def simulate_scene(
     distance: Annotated[
         float, typer.Option(min=1e-3, help="From what they look at, m.", rich_help_panel=_VIEW)
     ] = 2.7,
+    lane: Annotated[
+        float, typer.Option(min=0.1, help="Length of a survey's lanes, m.", rich_help_panel=_VIEW)
+    ] = 4.0,
     rig_side: Annotated[
         float, typer.Option(min=1e-3, help="Between neighbours in the rig, m.", rich_help_panel=_VIEW)
     ] = 0.6,
@@ -140,7 +143,7 @@ def simulate_scene(
 ) -> None:
     """Make a scene with known truth: moving cameras, a COLMAP model of them, 2D tracks of individuals.
 
-    Writes a folder that 'acino-fte triangulate-scene' reads: sparse/, tracks/, scene.yaml, truth.
+    Writes a folder that 'acino-fte scene' reads: sparse/, tracks/, scene.yaml, truth.
     """
     from acino_fte.data_tools.scene_folder import write_scene
     from acino_fte.data_tools.simulate_scene import SceneSimulation
@@ -156,6 +159,7 @@ def simulate_scene(
             formation=formation.value,
             n_cameras=cameras,
             distance=distance,
+            lane=lane,
             rig_side=rig_side,
             lens=tuple(lens.split(",")) if "," in lens else lens,
             shared_lens=shared_lens,

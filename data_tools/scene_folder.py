@@ -207,7 +207,7 @@ def _write_model(scene: SimulatedScene, folder: Path, layout: Layout) -> None:
         np.repeat([camera.model_id for camera in cameras], count),
         np.concatenate([camera.rotation for camera in cameras]),
         np.concatenate([camera.translation for camera in cameras]),
-        xyz=np.round(cloud.xyz, 6),
+        xyz=cloud.xyz,  # not rounded: the answer must not hang on the gauge
         rgb=cloud.rgb,
         error=np.round(cloud.error, 4),
         observed_image=image,

@@ -25,7 +25,7 @@ ScenePath = Literal["survey", "orbit", "walk"]
 Formation = Literal["rig", "free", "fixed"]
 Signal = Callable[[np.ndarray], np.ndarray]
 
-_LANE, _SPACING = 25.0, 2.0  # m, of a survey
+_SPACING = 2.0  # m, between the lanes of a survey
 _SPEED = {"survey": 0.8, "orbit": 0.3, "walk": 1.0}  # m/s; of an orbit, rad/s
 _SWAY, _TURN = 0.05, np.radians(2.0)  # of a camera in a hand or on a drone: m and rad
 _SWAY_BAND, _ROAM_BAND = (0.05, 0.6), (0.05, 0.4)  # Hz
@@ -47,10 +47,10 @@ def waves(rng: np.random.Generator, shape: tuple[int, ...], band: tuple[float, f
     return at
 
 
-def target_path(path: ScenePath, rng: np.random.Generator) -> Signal:
-    """Where on the ground (T, 3) the cameras and the animals are about."""
+def target_path(path: ScenePath, lane: float, rng: np.random.Generator) -> Signal:
+    """Where on the ground (T, 3) cameras and animals are about; `lane`: length of a survey's lanes, m."""
     if path == "survey":
-        return lambda time: _lawnmower(_SPEED["survey"] * np.asarray(time, dtype=float))
+        return lambda time: _lawnmower(_SPEED["survey"] * np.asarray(time, dtype=float), lane)
     drift = waves(rng, (2,), (0.02, 0.1))
 
     def at(time: np.ndarray) -> np.ndarray:
@@ -62,17 +62,17 @@ def target_path(path: ScenePath, rng: np.random.Generator) -> Signal:
     return at
 
 
-def _lawnmower(along: np.ndarray) -> np.ndarray:
-    """Points at arc lengths (T,) of straight lanes joined by half circles, (T, 3)."""
+def _lawnmower(along: np.ndarray, length: float) -> np.ndarray:
+    """Points at arc lengths (T,) of straight lanes of a length (m) joined by half circles, (T, 3)."""
     radius = 0.5 * _SPACING
-    period = _LANE + np.pi * radius
+    period = length + np.pi * radius
     lane = np.floor(along / period)
     rest = along - lane * period
     forward = np.where(lane % 2 == 0, 1.0, -1.0)
-    angle = np.maximum(rest - _LANE, 0.0) / radius
-    x = np.minimum(rest, _LANE) + radius * np.sin(angle)
+    angle = np.maximum(rest - length, 0.0) / radius
+    x = np.minimum(rest, length) + radius * np.sin(angle)
     y = lane * _SPACING + radius * (1.0 - np.cos(angle))
-    return np.stack([np.where(forward > 0, x, _LANE - x), y, np.zeros_like(x)], axis=-1)
+    return np.stack([np.where(forward > 0, x, length - x), y, np.zeros_like(x)], axis=-1)
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,8 @@ class SceneSimulation:
         C. They are called ``cam0``, ``cam1``, …
     distance : float
         From the cameras to what they look at, m.
+    lane : float
+        Length of a survey's lanes, m; they are 2 m apart.
     rig_side : float
         Distance between neighbours in a rig, m.
     lens : str or tuple of str
@@ -111,6 +113,7 @@ class SceneSimulation:
     formation: Formation = "rig"
     n_cameras: int = 4
     distance: float = 2.7
+    lane: float = 4.0
     rig_side: float = 0.6
     lens: str | tuple[str, ...] = "OPENCV"
     shared_lens: bool = False
@@ -231,7 +234,7 @@ def simulate_scene(options: SceneSimulation) -> SimulatedScene:
         With its truth; the same options give the same numbers.
     """
     path_rng, animal_rng, lens_rng, model_rng, gauge_rng, *view_rngs = _generators(options)
-    target = target_path(options.path, path_rng)
+    target = target_path(options.path, options.lane, path_rng)
     names, paths = individuals(target, options.n_animals, options.wand, options.roam, animal_rng)
     poses = _poses(options, target, path_rng)
     cameras = tuple(
@@ -313,7 +316,15 @@ def _check(options: SceneSimulation) -> None:
     for key, names in (("path", get_args(ScenePath)), ("formation", get_args(Formation))):
         if getattr(options, key) not in names:
             _fail(options, key, f"one of {', '.join(names)}")
-    lowest = {"n_frames": 1, "n_cameras": 1, "key_step": 1, "fps": 1e-6, "distance": 1e-3, "focal": 1e-3}
+    lowest = {
+        "n_frames": 1,
+        "n_cameras": 1,
+        "key_step": 1,
+        "fps": 1e-6,
+        "distance": 1e-3,
+        "focal": 1e-3,
+        "lane": 0.1,
+    }
     for key in (field.name for field in fields(options)):
         value = getattr(options, key)
         if isinstance(value, float | int) and not lowest.get(key, 0) <= value < np.inf:

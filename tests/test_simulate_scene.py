@@ -234,7 +234,7 @@ def test_the_wand_has_its_length_and_individuals_their_names():
 
 
 def test_a_survey_goes_back_and_forth():
-    target = target_path("survey", np.random.default_rng(0))
+    target = target_path("survey", 25.0, np.random.default_rng(0))
     points = target(np.linspace(0, 200, 4001))
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     np.testing.assert_allclose(step, 0.8 * 0.05, rtol=1e-3)  # half circles join the lanes

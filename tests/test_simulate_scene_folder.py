@@ -127,10 +127,10 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
 
 
 FLAGS = (
-    "--frames 40 --fps 50 --path orbit --formation free --cameras 2 --distance 4 --lens OPENCV,RADIAL "
-    "--clock-offset 0,-2.5 --clock-drift 0,0.001 --key-step 4 --unregistered 0.1 --centre-noise-mm 1 "
-    "--turn-noise 0.1 --landmarks 80 --no-gauge --layout folder --wand 0 --animals 2 --noise-px 0.5 "
-    "--missed 0.2 --outliers 0.1 --swaps 1 --seed 3"
+    "--frames 40 --fps 50 --path orbit --formation free --cameras 2 --distance 4 --lane 9 "
+    "--lens OPENCV,RADIAL --clock-offset 0,-2.5 --clock-drift 0,0.001 --key-step 4 --unregistered 0.1 "
+    "--centre-noise-mm 1 --turn-noise 0.1 --landmarks 80 --no-gauge --layout folder --wand 0 --animals 2 "
+    "--noise-px 0.5 --missed 0.2 --outliers 0.1 --swaps 1 --seed 3"
 )
 
 
