@@ -21,7 +21,7 @@ import numpy as np
 if TYPE_CHECKING:
     from acino_fte.data_tools.scene import SceneResult
 
-_MOST_CLOUD = 4000  # points of the cloud in a figure
+_MOST_CLOUD = 3000  # points of the cloud in a figure
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from acino_fte.data_tools.scene_drawing import serve; serve()"
@@ -143,7 +143,7 @@ class FigureProcess:
     def __enter__(self) -> FigureProcess:
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _CHILD, json.dumps(sys.path)],
+                [sys.executable, "-c", _CHILD, json.dumps([str(p) for p in sys.path])],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

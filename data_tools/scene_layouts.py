@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 MOST_CELLS = 50_000_000
 """A dense table with more cells than this is not made."""
+_SMALL = 1_000_000
+"""Variables with more values than this are compressed, which takes longer than all else."""
 _FULL = ("time", "space", "keypoints", "individuals")
 
 
@@ -65,7 +67,9 @@ def write_movement(
         for key, values in words.items():
             file.create_variable(key, (key,), h5py.string_dtype(), data=np.array(values, dtype=object))
         for key, (dims, values) in _variables(tracks, first, n).items():
-            packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1} if values.size else {}
+            packed: dict[str, Any] = {}
+            if values.size > _SMALL:
+                packed |= {"compression": "gzip", "compression_opts": 1}
             if values.dtype.kind == "f":
                 packed["fillvalue"] = np.float32(np.nan)
             file.create_variable(key, dims, values.dtype, data=values, **packed)

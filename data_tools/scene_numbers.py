@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from acino_fte.data_tools.scene_truth import SceneTruth
 
 TRIANGULATED, NOTHING = "triangulated", "nothing_triangulated"
-_MOST_PAIRS = 15
+MOST_PAIRS = 15
 """Distances between individuals are listed when there are no more pairs than this."""
 
 
@@ -154,7 +154,7 @@ def individual_distances(tracks: SceneTracks) -> list[dict[str, Any]]:
         individuals (two names), mean, median, sd (m), count; nothing when there are very many pairs.
     """
     n = len(tracks.individuals)
-    if n * (n - 1) // 2 > _MOST_PAIRS:
+    if n * (n - 1) // 2 > MOST_PAIRS:
         return []
     found = []
     for a, b in combinations(range(n), 2):

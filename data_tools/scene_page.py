@@ -65,7 +65,7 @@ def write_scene_page(result: SceneResult, metrics: dict[str, Any], folder: Path)
         title=f"{metrics['scene']}: tracks in 3D from {metrics['n_cameras']} cameras",
         status=_headline(metrics),
         advice=_advice(metrics),
-        colour="red" if not metrics["n_points"]["all"] else "amber" if metrics["warnings"] else "green",
+        colour=_colour(metrics),
         sections=sections,
         data=data,
     )
@@ -155,6 +155,17 @@ def _cloud(result: SceneResult) -> dict[str, Any] | None:
     return {"xyz": thinned(cloud.xyz, _MOST_CLOUD), "rgb": rgb}
 
 
+def _upright(metrics: dict[str, Any]) -> bool:
+    return (metrics["axes"] or {}).get("how", "none") != "none"
+
+
+def _colour(metrics: dict[str, Any]) -> str:
+    """``green`` for tracks in metres and upright, ``amber`` for others, ``red`` without any."""
+    if not metrics["n_points"]["all"]:
+        return "red"
+    return "green" if metrics["scale"] and _upright(metrics) else "amber"
+
+
 def _headline(metrics: dict[str, Any]) -> str:
     points = metrics["n_points"]["all"]
     if not points:
@@ -165,8 +176,7 @@ def _headline(metrics: dict[str, Any]) -> str:
 def _advice(metrics: dict[str, Any]) -> str:
     if not metrics["n_points"]["all"]:
         return "Check that tracks and images have the same frame numbers, and that two cameras see one place."
-    how = (metrics["axes"] or {}).get("how")
-    upright = "z is up" if how and how != "none" else "the axes are those of the model, z need not be up"
+    upright = "z is up" if _upright(metrics) else "the axes are those of the model, z need not be up"
     if metrics["scale"]:
         return f"Lengths are in metres; {upright}."
     return f"There is no scale: lengths are in units of the model, not metres; {upright}."

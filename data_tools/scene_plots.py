@@ -170,7 +170,7 @@ def _panel(
 ) -> None:
     pick, unit = list(shown), drawing.unit
     if len(drawing.cloud):
-        axes.plot(*drawing.cloud[:, pick].T, ",", color="#B9B9B9", rasterized=True, zorder=0)
+        axes.plot(*drawing.cloud[:, pick].T, ".", color="#B9B9B9", ms=1.2, mew=0, zorder=0)
     new = np.r_[True, (np.diff(drawing.pose_camera) != 0) | (np.diff(drawing.pose_frame) != 1)]
     paths = [
         drawing.pose_centre[a:b, pick] for a, b in zip(*runs(new[: len(drawing.pose_camera)]), strict=True)
@@ -203,7 +203,7 @@ def quality_figure(drawing: SceneDrawing) -> Figure:
     left, right = 0.8 / _WIDTH, 6.6 / _WIDTH
     upper = figure.add_axes((left, 3.0 / height, right - left, rows / height))
     lower = figure.add_axes((left, 0.5 / height, right - left, 2.3 / height), sharex=upper)
-    beside = figure.add_axes((7.2 / _WIDTH, 0.5 / height, 2.2 / _WIDTH, (rows + 2.5) / height))
+    beside = figure.add_axes((7.45 / _WIDTH, 0.5 / height, 2.0 / _WIDTH, (rows + 2.5) / height))
     _states(upper, drawing)
     _spread(lower, drawing)
     _distances(beside, drawing)

@@ -156,5 +156,5 @@ def _labels(names: Sequence[str], index: np.ndarray) -> Cells:
 def _quoted(name: str) -> str:
     """A name as a cell: in quotation marks where it needs them."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="").writerow([name])
-    return "" if name == "" else text.getvalue()
+    csv.writer(text, lineterminator="\r\n").writerow([name])  # which is what makes it quote both
+    return "" if name == "" else text.getvalue()[:-2]

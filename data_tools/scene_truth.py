@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _NAMES = ("individual", "identity", "animal", "id")
 _FAR, _FITS = 5.0, 4  # medians from which on a point does not count in the next fit; fits
-_MOST_PAIRS = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,10 +147,10 @@ def _scores(tracks: SceneTracks, target: np.ndarray, change: Similarity) -> dict
 
 def _pair_errors(tracks: SceneTracks, target: np.ndarray, scale: float) -> np.ndarray:
     """By how much the distances between individuals are wrong, mm, of points of two views or more."""
-    from acino_fte.data_tools.scene_numbers import common_points
+    from acino_fte.data_tools.scene_numbers import MOST_PAIRS, common_points
 
     n = len(tracks.individuals)
-    pairs = list(combinations(range(n), 2)) if n * (n - 1) // 2 <= _MOST_PAIRS else []
+    pairs = list(combinations(range(n), 2)) if n * (n - 1) // 2 <= MOST_PAIRS else []
     errors = []
     for a, b in pairs:
         i, j = common_points(tracks, a, b)
