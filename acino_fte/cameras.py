@@ -276,7 +276,10 @@ def _check_camera(camera: Camera) -> None:
 
 
 def _no_rotation(rotation: np.ndarray) -> tuple[float, float]:
-    """Largest |R·Rᵀ − 1| and least determinant of rotations (…, 3, 3), by vectors over all of them."""
+    """Largest |R·Rᵀ − 1| and least determinant of rotations (…, 3, 3); of many, by vectors over them all."""
+    if rotation.ndim == 2:
+        gram = rotation @ rotation.T
+        return float(np.max(np.abs(gram - np.eye(3)))), float(np.linalg.det(rotation))
     r = np.ascontiguousarray(np.moveaxis(rotation.reshape(-1, 3, 3), 0, -1))
     if r.shape[-1] == 0:
         return 0.0, 1.0
