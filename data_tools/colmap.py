@@ -287,7 +287,10 @@ def _observations(
     if not known.all():
         lost = len(ids) - int(known.sum())
         notes.append(f"{lost} of {len(ids)} observations are of points that points3D lacks: left out.")
-    known &= np.isfinite(xy).all(axis=1)
+    finite = np.isfinite(xy).all(axis=1)
+    if not finite.all():
+        notes.append(f"{int((~finite).sum())} of {len(ids)} observations have no finite pixel: left out.")
+    known &= finite
     return image[known], point[known], xy[known] - HALF_PIXEL
 
 

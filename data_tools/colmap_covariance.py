@@ -31,6 +31,7 @@ _MAD_TO_SD = 1.4826
 _GROSS = 4.0  # residuals beyond this many standard deviations count nothing
 _IMAGE_FREEDOMS, _POINT_FREEDOMS, _GAUGE_FREEDOMS = 6, 3, 7
 _SINGULAR = 1e-13
+_NO_NOISE = 1e-16  # px²; residuals are those of a simulation without noise
 _MEDIAN_CHI2_6 = 5.348
 _ADJUSTED = 4.0  # steps that take more than this, against chance: the poses are not adjusted
 _GROSS_POSE = 20.0
@@ -118,6 +119,8 @@ def pose_errors(model: ColmapModel, min_observations: int = MIN_OBSERVATIONS) ->
     if not fixed.any() or not freedoms > 0:
         return PoseErrors(inverse * np.nan, sigma, adjusted=True)
     after = (rest - taken.sum()) / freedoms
+    if after < _NO_NOISE:
+        return PoseErrors(inverse * sigma**2, sigma, adjusted=True)
     ratio = float(np.median(taken)) / (_MEDIAN_CHI2_6 * after)
     if ratio < _ADJUSTED:
         return PoseErrors(inverse * sigma**2 * max(1.0, ratio), sigma, adjusted=True)

@@ -415,6 +415,29 @@ def test_a_name_that_is_no_text(plain, tmp_path):
     assert "images.bin" in message(read_colmap, tmp_path / "m").file
 
 
+def test_points_in_any_order(plain, tmp_path):
+    def backwards(data: bytes) -> bytes:
+        records, at = [], 8
+        while at < len(data):
+            (length,) = struct.unpack_from("<Q", data, at + 43)
+            records.append(data[at : at + 51 + 8 * length])
+            at += len(records[-1])
+        return data[:8] + b"".join(records[::-1])
+
+    _broken(plain, tmp_path, "points3D", backwards)
+    same(read_colmap(tmp_path / "m"), read_colmap(plain))
+
+
+def test_pixels_that_are_not_finite_are_noted(plain, tmp_path):
+    first = 8 + 64 + len("cam0/000000.png") + 1 + 8
+    _broken(
+        plain, tmp_path, "images", lambda data: data[:first] + struct.pack("<d", np.nan) + data[first + 8 :]
+    )
+    model, whole = read_colmap(tmp_path / "m"), read_colmap(plain)
+    assert "no finite pixel" in model.notes[0]
+    np.testing.assert_array_equal(model.observed_xy, whole.observed_xy[1:])
+
+
 def test_points_that_are_missing_are_noted(tmp_path):
     """A text file that ends at the end of a line: pycolmap takes it for whole."""
     folder = structure().write(tmp_path / "m")

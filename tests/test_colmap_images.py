@@ -275,6 +275,28 @@ def test_poses_from_elsewhere(kind, gross):
     assert result.noise_px == pytest.approx(0.5, rel=0.15)
 
 
+def test_a_few_gross_poses_do_not_spoil_the_others():
+    rng = np.random.default_rng(6)
+    true = model(300, 25, seed=4, noise_px=0.5)
+    error = rng.normal(0, np.repeat([2e-3, 8e-3], 3), (300, 6))
+    error[7::60] *= 12
+    result = pose_errors(moved_pose(true, error))
+    sd = np.sqrt(np.diagonal(result.covariance[0]))
+    np.testing.assert_allclose(sd, np.repeat([2e-3, 8e-3], 3), rtol=0.15)
+
+
+def test_poses_that_are_a_little_off_their_minimum():
+    """As a robust loss or a rounded file leaves them: the covariance grows by as much."""
+    rng = np.random.default_rng(7)
+    true = adjusted(model(60, 25, seed=4, noise_px=0.5))
+    small = pose_errors(true)
+    half = np.linalg.cholesky(small.covariance)
+    off = pose_errors(moved_pose(true, np.einsum("nij,nj->ni", half, rng.normal(0, 1.6, (60, 6)))))
+    assert small.adjusted and off.adjusted
+    growth = np.trace(off.covariance, axis1=1, axis2=2) / np.trace(small.covariance, axis1=1, axis2=2)
+    np.testing.assert_allclose(growth / (off.noise_px / small.noise_px) ** 2, 1.6**2, rtol=0.25)
+
+
 def test_noise_counts_freedoms_and_not_outliers():
     rng = np.random.default_rng(2)
     m = model(40, 200, noise_px=0.8)
@@ -319,6 +341,16 @@ def test_models_without_observations():
     assert np.isnan(result.noise_px)
     scarce = {key: getattr(m, key)[:20] for key in none}  # fewer numbers than freedoms
     assert np.isnan(pose_covariances(replace(m, **scarce))).all()
+
+
+def test_models_without_noise():
+    """The residuals are what floating point leaves."""
+    m = model()
+    result = pose_errors(m)
+    assert result.adjusted and result.noise_px < 1e-9
+    assert (np.diagonal(result.covariance, axis1=1, axis2=2) < 1e-20).all()
+    exact = replace(m, observed_xy=m.observed_xy - residuals(m))
+    assert np.isfinite(pose_covariances(exact)).all()
 
 
 @pytest.mark.parametrize("folder", RIGS, ids=lambda p: p.name)
