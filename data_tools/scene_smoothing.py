@@ -24,6 +24,7 @@ from acino_fte.data_tools.trajectories3d import Trajectories, smooth_trajectorie
 from acino_fte.data_tools.trajectory_rows import ViewRows
 
 _AROUND, _FIRM = 15, 1e-9  # frames on both sides that count as neighbours; keeps their sum invertible
+_JUMP, _JUMP_ROUNDS, _NEIGHBOURS = 8.0, 3, 8  # medians; rounds; frames from the dot before to that after
 _BRIDGE = 10  # a path goes on across gaps of so many times the longest gap that is filled
 
 
@@ -71,17 +72,18 @@ def smooth_points(rows: SceneRows, views: Views, fit: PointFit, max_gap: int) ->
     """
     decided = np.bincount(rows.point[fit.used], minlength=rows.n_points)[rows.point] > 0
     chosen = np.flatnonzero(fit.used | ~decided)
-    variance = _row_variances(rows, views, fit)
+    variance, doubtful = _row_variances(rows, views, fit), sudden_jumps(rows) & ~fit.used
     parts = [chosen[rows.camera[chosen] == c] for c in range(len(views.cameras))]
     paths = smooth_trajectories(
         views.cameras,
         [
-            ViewRows(rows.frame[p], rows.measured.xy[k], rows.individual[p], variance[k])
+            ViewRows(rows.frame[p], rows.measured.xy[k], rows.individual[p], variance[k], doubtful[k])
             for k, p in ((k, rows.point[k]) for k in parts)
         ],
         fit.noise.px,
         max_gap=_BRIDGE * max_gap,
         first_frame=views.first_frame,
+        sudden=False,
     )
     used = np.zeros(len(rows.point), dtype=bool)
     for k, wrong, distance in zip(parts, paths.wrong, paths.distance, strict=True):
@@ -93,6 +95,40 @@ def smooth_points(rows: SceneRows, views: Views, fit: PointFit, max_gap: int) ->
     return PathPoints(
         paths.group[keep], paths.frame[keep], paths.position[keep], covariance[keep], paths.source[keep], used
     )
+
+
+def sudden_jumps(rows: SceneRows) -> np.ndarray:
+    """Dots (P,) that lie beside the line from the one before to the one after, in their own view.
+
+    Several times as far as such dots usually do in that track. Where nothing else sees the individual, a
+    wrong dot may take the path with it, and right ones seem wrong.
+    """
+    track = rows.individual[rows.point] * (rows.camera.max(initial=0) + 1) + rows.camera
+    order = np.lexsort((rows.frame[rows.point], track))
+    wrong = np.zeros(len(order), dtype=bool)
+    for _ in range(_JUMP_ROUNDS):
+        rest = order[~wrong[order]]
+        beside = _beside(track[rest], rows.frame[rows.point[rest]], rows.measured.xy[rest])
+        peak = beside >= np.maximum(np.append(beside[1:], 0.0), np.append(0.0, beside[:-1]))
+        wrong[rest[peak & (beside > _JUMP)]] = True
+    return wrong
+
+
+def _beside(track: np.ndarray, frame: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """How far each dot lies from the line between its neighbours, in medians of its track; 0 without two."""
+    out = np.zeros(len(track))
+    if len(track) < 3:
+        return out
+    near = (track[2:] == track[:-2]) & (frame[2:] - frame[:-2] <= _NEIGHBOURS)
+    share = ((frame[1:-1] - frame[:-2]) / np.maximum(frame[2:] - frame[:-2], 1))[:, None]
+    off = np.linalg.norm(xy[1:-1] - (1 - share) * xy[:-2] - share * xy[2:], axis=1)
+    off, owner = off[near], track[1:-1][near]
+    order = np.lexsort((off, owner))
+    _, start, count = np.unique(owner[order], return_index=True, return_counts=True)
+    usual = dict(zip(owner[order][start].tolist(), off[order][start + count // 2].tolist(), strict=True))
+    scale = np.array([usual[name] for name in owner.tolist()])
+    out[1:-1][near] = off / np.maximum(scale, 1e-9)
+    return out
 
 
 def _row_variances(rows: SceneRows, views: Views, fit: PointFit) -> np.ndarray:

@@ -139,6 +139,7 @@ def smooth_trajectories(
     max_gap: int = 30,
     extend: int = 0,
     first_frame: int = 0,
+    sudden: bool = True,
 ) -> Trajectories:
     """The most probable 3D path of every group.
 
@@ -160,6 +161,9 @@ def smooth_trajectories(
         Frames to add before the first and after the last row.
     first_frame : int
         Frame of row 0 of moving cameras.
+    sudden : bool
+        Whether many wrong rows at once may be a sudden movement, which heavier tails of the innovations can
+        explain. Where wrong rows are known to come in crowds, False is faster and safer.
 
     Returns
     -------
@@ -175,12 +179,14 @@ def smooth_trajectories(
     nodes = make_nodes(group, frame, max_gap, extend)
     variance = _variances(cameras, views, noise_px)
     each = np.concatenate([variance[c][place[camera == c]] for c in range(len(views))])
-    rows = Measurements(cameras, nodes.find(group, frame), camera, frame - first_frame, xy, each)
+    doubtful = [np.zeros(len(v.frame), dtype=bool) if v.doubtful is None else v.doubtful for v in views]
+    wary = np.concatenate([doubtful[c][place[camera == c]] for c in range(len(views))])
+    rows = Measurements(cameras, nodes.find(group, frame), camera, frame - first_frame, xy, each, wary)
     points = meeting_points(rows, len(nodes.frame))
     nodes, kept_nodes = take_pieces(nodes, _any(np.isfinite(points[:, 0]), nodes.pieces))
     kept = np.flatnonzero(kept_nodes[rows.node])
     rows = rows.subset(kept, (np.cumsum(kept_nodes) - 1)[rows.node[kept]])
-    fit = fit_paths(rows, nodes.pieces, points[kept_nodes], motion, gate)
+    fit = fit_paths(rows, nodes.pieces, points[kept_nodes], motion, gate, sudden)
     return _collect(fit, rows, nodes, views, place[kept], first_frame)
 
 

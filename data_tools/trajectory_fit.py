@@ -21,7 +21,10 @@ from acino_fte.data_tools.trajectory_smoother import ChainFactor
 
 _MIN_SINE2 = np.sin(np.radians(1.0)) ** 2
 _MIN_HEAVY = 4  # steps with heavy tails
-_MAX_STEPS, _DONE = 8, 0.5  # Gauss–Newton; the last step moves no pixel by more than this part of σ
+_MAX_STEPS, _DONE = 25, 0.5  # Gauss–Newton; the last step moves no pixel by more than this part of σ
+_GAIN = 0.1  # nor does it make a path cheaper by more than half of this, which depth may that no pixel shows
+_WORSE, _SHORTEST = 1e-9, 1e-3  # a step that makes a path dearer is halved, down to this part of it
+_BEHIND = 1e6  # what a row behind its camera costs
 _ALONE = 1e-3  # keeps rows that nothing else predicts from being judged by rounding errors
 _ROUNDS, _HEAVY_ROUNDS, _ESTIMATES = 12, 3, 3
 _CROWD, _CROWD_FRAMES = 4, 5  # rows that leave within so many frames are a crowd
@@ -60,7 +63,12 @@ class PathFit:
 
 
 def fit_paths(
-    rows: Measurements, pieces: Pieces, points: np.ndarray, motion: MotionModel | None, gate: float
+    rows: Measurements,
+    pieces: Pieces,
+    points: np.ndarray,
+    motion: MotionModel | None,
+    gate: float,
+    sudden: bool = True,
 ) -> PathFit:
     """Fit all paths; wrong rows leave, and rows that belong after all come back.
 
@@ -76,8 +84,10 @@ def fit_paths(
         The prior; by default it is estimated, and again once wrong rows have left.
     gate : float
         Distance beyond which a row is wrong.
+    sudden : bool
+        Whether a crowd of wrong rows may be a sudden movement.
     """
-    prior = motion or _estimated(rows, pieces, points, gate)
+    prior = motion or _estimated(rows, pieces, points, gate, sudden)
     n = pieces.n_nodes
     x, covariance = np.empty((n, 3)), np.empty((n, 3, 3))
     used, distance, residual = np.empty(len(rows), dtype=bool), np.empty(len(rows)), np.empty((len(rows), 2))
@@ -87,14 +97,19 @@ def fit_paths(
         at = slice(pieces.start[mine][0], pieces.start[mine][-1] + pieces.length[mine][-1])
         chosen = np.flatnonzero((rows.node >= at.start) & (rows.node < at.stop))
         part = rows.subset(chosen, rows.node[chosen] - at.start)
-        fit = _settled(part, Pieces(pieces.length[mine]), points[at], prior, gate)
+        fit = _settled(part, Pieces(pieces.length[mine]), points[at], prior, gate, sudden)
         x[at], covariance[at] = fit.x, fit.covariance
         used[chosen], distance[chosen], residual[chosen] = fit.used, fit.distance, fit.residual
     return PathFit(x, covariance, used, distance, residual, prior)
 
 
 def _settled(
-    rows: Measurements, pieces: Pieces, points: np.ndarray, motion: MotionModel, gate: float
+    rows: Measurements,
+    pieces: Pieces,
+    points: np.ndarray,
+    motion: MotionModel,
+    gate: float,
+    sudden: bool,
 ) -> PathFit:
     """Fit with a given prior until no row leaves or returns.
 
@@ -102,13 +117,13 @@ def _settled(
     rows leave in a crowd are fitted again with all rows and heavy tails, which forgive a rare large
     innovation. That counts where it spares half of the rows; a group of two animals stays as it was.
     """
-    start = bridge(points, pieces)
+    start = starting_path(rows, pieces, points, ~rows.doubtful)
     linear = rows.linearise(start)
     fit = _fit(rows, pieces, start, ~_doubtful(rows, linear[0], points), motion, linear)
     everywhere = np.ones(len(pieces.length), dtype=bool)
     fit = _rounds(fit, rows, pieces, motion, gate, everywhere, _ROUNDS)
     crowded = _crowded(rows.node[~fit.used], pieces)
-    if crowded.any() and not np.isfinite(motion.tails):
+    if sudden and crowded.any() and not np.isfinite(motion.tails):
         heavy = replace(motion, tails=_TAILS)
         used = fit.used | crowded[pieces.owner[rows.node]]
         other = _refit(fit, rows, pieces, used, crowded, heavy)
@@ -163,7 +178,9 @@ def _crowded(node: np.ndarray, pieces: Pieces) -> np.ndarray:
     return np.bincount(owner[: len(crowd)][crowd & inside], minlength=len(pieces.length)) > 0
 
 
-def _estimated(rows: Measurements, pieces: Pieces, points: np.ndarray, gate: float) -> MotionModel:
+def _estimated(
+    rows: Measurements, pieces: Pieces, points: np.ndarray, gate: float, sudden: bool
+) -> MotionModel:
     """The prior from windows spread over all pieces; again after wrong rows have left."""
     if not pieces.n_nodes:
         return MotionModel(1.0)
@@ -172,12 +189,12 @@ def _estimated(rows: Measurements, pieces: Pieces, points: np.ndarray, gate: flo
     place[nodes] = np.arange(len(nodes))
     chosen = np.flatnonzero(place[rows.node] >= 0)
     rows, points = rows.subset(chosen, place[rows.node[chosen]]), points[nodes]
-    x = bridge(points, windows)
+    x = starting_path(rows, windows, points, ~rows.doubtful)
     residual, slope = rows.linearise(x)
     used = ~_doubtful(rows, residual, points)
     motion = estimate_motion(x, *rows.information(residual, slope, used, len(x)), windows)
     for _ in range(_ESTIMATES):
-        fit = _settled(rows, windows, points, motion, gate)
+        fit = _settled(rows, windows, points, motion, gate, sudden)
         if (fit.used == used).all():
             break
         used, x = fit.used, fit.x
@@ -187,11 +204,11 @@ def _estimated(rows: Measurements, pieces: Pieces, points: np.ndarray, gate: flo
 
 
 def _doubtful(rows: Measurements, residual: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Rows (P,) of nodes whose rays pass each other at some distance."""
+    """Rows (P,) that are given as such, or of nodes whose rays pass each other at some distance."""
     n_nodes, met = len(points), np.isfinite(points[:, 0])
     squared = np.nan_to_num((residual**2).sum(1) / rows.variance, nan=np.inf)
     total = np.bincount(rows.node, squared, n_nodes)
-    return (met & (total > _DOUBT * np.bincount(rows.node, minlength=n_nodes)))[rows.node]
+    return rows.doubtful | (met & (total > _DOUBT * np.bincount(rows.node, minlength=n_nodes)))[rows.node]
 
 
 def _judge(fit: PathFit, rows: Measurements, pieces: Pieces, gate: float) -> np.ndarray:
@@ -230,17 +247,17 @@ def _refit(
     changed: np.ndarray,
     motion: MotionModel,
 ) -> PathFit:
-    """Fit some of the pieces again, (S,) bool, with other rows and another prior."""
+    """Fit some of the pieces again, (S,) bool, with other rows and another prior.
+
+    What single views see begins on its rays again: a wrong row may have pulled it where no step leads back.
+    """
     at_node, at_row = changed[pieces.owner], changed[pieces.owner[rows.node]]
     chosen = np.flatnonzero(at_row)
     new_node = np.cumsum(at_node) - 1
-    part = _fit(
-        rows.subset(chosen, new_node[rows.node[chosen]]),
-        Pieces(pieces.length[changed]),
-        fit.x[at_node],
-        used[chosen],
-        motion,
-    )
+    mine, its = rows.subset(chosen, new_node[rows.node[chosen]]), Pieces(pieces.length[changed])
+    views = np.bincount(mine.node[used[chosen]], minlength=its.n_nodes)
+    begin = starting_path(mine, its, np.where(views[:, None] >= 2, fit.x[at_node], np.nan), used[chosen])
+    part = _fit(mine, its, begin, used[chosen], motion)
     whole = {key: getattr(fit, key).copy() for key in ("x", "covariance", "distance", "residual")}
     for key in ("x", "covariance"):
         whole[key][at_node] = getattr(part, key)
@@ -263,6 +280,29 @@ def meeting_points(measurements: Measurements, n_nodes: int) -> np.ndarray:
     points = np.full((n_nodes, 3), np.nan)
     points[meet] = np.linalg.solve(total[meet][..., :3], total[meet][..., 3:])[..., 0]
     return points
+
+
+def starting_path(
+    measurements: Measurements, pieces: Pieces, points: np.ndarray, used: np.ndarray | None = None
+) -> np.ndarray:
+    """Where the fit begins, (T, 3): meeting points, bridges between them, on the ray of a single view.
+
+    From a point beside its ray the first Gauss–Newton step goes astray: pixels are not linear in depth.
+    """
+    path = bridge(points, pieces)
+    lone = np.isnan(points[:, 0])[measurements.node]
+    if used is not None:
+        lone &= used
+    if not lone.any():
+        return path
+    chosen = np.flatnonzero(lone)
+    node = measurements.node[chosen]
+    origin, direction = measurements.subset(chosen, node).rays()
+    depth = ((path[node] - origin) * direction).sum(1)
+    on_ray = origin + direction * depth[:, None]
+    good = np.isfinite(on_ray).all(1) & (depth > 0)
+    path[node[good]] = on_ray[good]
+    return path
 
 
 def bridge(points: np.ndarray, pieces: Pieces) -> np.ndarray:
@@ -310,18 +350,30 @@ def improve(
     """
     sigma = np.sqrt(measurements.variance)
     heavy, weight = np.isfinite(motion.tails), None
+    before, length = None, np.ones(len(pieces.length))
     for number in range(_MAX_STEPS):
         residual, slope = linear or measurements.linearise(x)
         linear = None
+        cost = _cost(measurements, residual, used, x, pieces, motion)
+        if before is not None and not heavy:
+            worse = ~(cost <= before[0] + _WORSE * (1.0 + np.abs(before[0]))) & (length > _SHORTEST)
+            if worse.any():  # a shorter step for these paths
+                length = np.where(worse, 0.5 * length, length)
+                x = np.where(
+                    worse[pieces.owner][:, None], before[1] + length[pieces.owner][:, None] * before[2], x
+                )
+                continue
         information, gradient = measurements.information(residual, slope, used, len(x))
         factor = ChainFactor(information, motion, pieces, weight)
-        step = factor.solve(gradient - factor.prior_times(x))
+        downhill = gradient - factor.prior_times(x)
+        step = factor.solve(downhill)
+        before, length = (cost, x, step), np.ones(len(pieces.length))
+        gain = np.bincount(pieces.owner, (step * downhill).sum(1), len(pieces.length))
         x = x + step
         moved = (slope * step[measurements.node][:, None]).sum(2)
         covariance, squared = factor.covariance_and_spread() if heavy else (None, None)
-        if not np.nanmax(np.abs(moved) * (used / sigma)[:, None], initial=0.0) > _DONE and not (
-            heavy and number < _MIN_HEAVY
-        ):
+        still = not np.nanmax(np.abs(moved) * (used / sigma)[:, None], initial=0.0) > _DONE
+        if still and not (gain > _GAIN).any() and not (heavy and number < _MIN_HEAVY):
             break
         if heavy:
             squared += (innovations(motion, pieces, x) ** 2).sum(1)
@@ -329,6 +381,23 @@ def improve(
     if covariance is None:
         covariance = factor.covariance()
     return x, covariance, residual - moved, slope
+
+
+def _cost(
+    measurements: Measurements,
+    residual: np.ndarray,
+    used: np.ndarray,
+    x: np.ndarray,
+    pieces: Pieces,
+    motion: MotionModel,
+) -> np.ndarray:
+    """What each path (S,) costs: its rows and its innovations, in units of their variances."""
+    squared = np.where(used, (residual**2).sum(1) / measurements.variance, 0.0)
+    rows = np.bincount(
+        pieces.owner[measurements.node], np.nan_to_num(squared, nan=_BEHIND), len(pieces.length)
+    )
+    new = (innovations(motion, pieces, x) ** 2).sum(1) / motion.variances[pieces.age]
+    return rows + np.bincount(pieces.owner, np.where(pieces.age > 0, new, 0.0), len(pieces.length))
 
 
 def deleted_distance(

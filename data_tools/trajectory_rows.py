@@ -28,12 +28,15 @@ class ViewRows:
         The group (animal) of each row, −1 for none.
     variance : (P,), optional
         Of each pixel coordinate, px²; by default that of the view's noise.
+    doubtful : (P,) bool, optional
+        Rows that look wrong. They do not count at first.
     """
 
     frame: np.ndarray
     xy: np.ndarray
     group: np.ndarray
     variance: np.ndarray | None = None
+    doubtful: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +106,8 @@ class Measurements:
         Pixels.
     variance : (P,)
         Of each pixel coordinate, px².
+    doubtful : (P,) bool, optional
+        Rows that do not count at first.
     """
 
     def __init__(
@@ -113,7 +118,9 @@ class Measurements:
         frame: np.ndarray,
         xy: np.ndarray,
         variance: np.ndarray,
+        doubtful: np.ndarray | None = None,
     ) -> None:
+        self.doubtful = np.zeros(len(node), dtype=bool) if doubtful is None else doubtful
         self.node, self.camera, self.xy, self.variance = node, camera, xy, variance
         self._cameras, self._frame = cameras, frame
         bounds = np.searchsorted(camera, np.arange(len(cameras) + 1))
@@ -129,7 +136,13 @@ class Measurements:
     def subset(self, rows: np.ndarray, node: np.ndarray) -> Measurements:
         """Some of the rows, with the nodes (K,) they have now."""
         return Measurements(
-            self._cameras, node, self.camera[rows], self._frame[rows], self.xy[rows], self.variance[rows]
+            self._cameras,
+            node,
+            self.camera[rows],
+            self._frame[rows],
+            self.xy[rows],
+            self.variance[rows],
+            self.doubtful[rows],
         )
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
