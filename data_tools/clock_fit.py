@@ -40,8 +40,9 @@ class ClockFit:
 class _Equations:
     """All samples at one set of clocks.
 
-    z (S,) in robust standard deviations of its pair; gradient (S, Q); noise (S, Q) its variance by pixel
-    noise over that of the rate's; pair (S,); time (S,).
+    z (S,): misses in robust standard deviations of their pair; rate (S,): their change per frame; noise (S,):
+    the variance of the rate by noise; design (S, Q): change of the second camera's time with the parameters;
+    pair (S,); time (S,).
     """
 
     z: np.ndarray
@@ -139,7 +140,7 @@ def _equations(
             (
                 found.z / scale,
                 found.rate / scale,
-                found.noise * np.ones(len(found.z)),
+                found.noise,
                 design,
                 np.full(len(found.z), index),
                 found.frame_a,
@@ -168,7 +169,7 @@ def _minimise(
         weight = np.where(np.abs(equations.z) < _TUKEY, (1 - (equations.z / _TUKEY) ** 2) ** 2, 0.0)
         gradient = equations.rate[:, None] * equations.design
         normal = (gradient * weight[:, None]).T @ gradient
-        normal[np.diag_indices_from(normal)] += 1e-9 * max(float(np.trace(normal)), 1e-300)
+        normal[np.diag_indices_from(normal)] += 1e-9 * float(np.trace(normal)) + 1e-12
         step = -np.linalg.solve(normal, gradient.T @ (weight * equations.z))
         step = np.clip(step, -2.0, 2.0)
         clocks[list(free), : 2 if drift else 1] += step.reshape(len(free), -1)

@@ -121,11 +121,10 @@ def _clarity(sums: np.ndarray, counts: np.ndarray, at: int) -> tuple[float, tupl
     curve = np.average(above, axis=0, weights=weight)
     scatter = np.sqrt(np.average((above - curve) ** 2, axis=0, weights=weight) / max(filled.sum() - 1, 1))
     clear = curve / np.maximum(scatter, 1e-9 + 0.02 * curve.max())
-    inner = np.flatnonzero((curve[1:-1] <= curve[:-2]) & (curve[1:-1] <= curve[2:])) + 1
+    hollows = np.flatnonzero((curve[1:-1] <= curve[:-2]) & (curve[1:-1] <= curve[2:])) + 1
     level = float(np.median(curve))
-    rivals = [
-        int(i) for i in inner if abs(i - at) > 2 and clear[i] < _CLEAR and _ridge(curve, at, i) > 0.5 * level
-    ]
+    close = [int(i) for i in hollows if abs(i - at) > 2 and clear[i] < _CLEAR]
+    rivals = [i for i in close if _ridge(curve, at, i) > 0.5 * level]
     notes: tuple[str, ...] = ()
     if rivals and level > 0:
         near = min((i - at for i in rivals), key=abs)

@@ -24,6 +24,8 @@ _TURNS = 0.02  # slow change of an offset's direction above which a pair is not 
 _VARIES = 0.01  # slow variation of a length that is worth a warning, as a share of it
 _ONE_FRAME = 0.01  # relative standard deviation of what was measured in one frame only
 _BLOCKS = 20
+_COMMON = 0.25  # share of the key frames that have to be common, else places are interpolated
+_GAP = 3.0  # median steps between key frames over which places are interpolated
 _DOUBTFUL = 0.3  # noise across a difference, as a share of it, from which a frame is not used
 
 
@@ -58,8 +60,8 @@ def between_cameras(first: KeyedCamera, second: KeyedCamera) -> MeasuredDistance
 
     For a rigid pair it is the length of the mean offset in the first camera's frame, which noise in any
     direction hardly lengthens; else the mean length of the difference, less what the noise adds when it is
-    the same in all directions. Without a common key frame the second camera is interpolated between its key
-    frames; a camera with one key frame counts as fixed.
+    the same in all directions. When few key frames are common, the second camera is interpolated between
+    its key frames; a camera with one key frame counts as fixed.
 
     Raises
     ------
@@ -82,8 +84,8 @@ def between_cameras(first: KeyedCamera, second: KeyedCamera) -> MeasuredDistance
         found = float(centre[0])
         found -= min(_fast_variance(length), float(np.average((length - found) ** 2, weights=weight))) / found
     sd, spread = _standard_error(series, weight)
-    notes += _varying(length, weight, names)
-    return MeasuredDistance(found, sd, len(offset), spread, rigid and not notes, tuple(notes))
+    warned = _varying(length, weight, names)
+    return MeasuredDistance(found, sd, len(offset), spread, rigid and not warned, (*notes, *warned))
 
 
 def between_points(
@@ -206,25 +208,36 @@ def geometric_median(values: np.ndarray, rounds: int = 60) -> np.ndarray:
 def _offsets(first: KeyedCamera, second: KeyedCamera, names: str) -> tuple[np.ndarray, list[str]]:
     """Offsets (K, 3) from the first to the second camera in the first camera's frame."""
     _, here, there = np.intersect1d(first.frame, second.frame, assume_unique=True, return_indices=True)
-    if len(here):
+    if len(here) >= _COMMON * min(len(first.frame), len(second.frame)):
         step = second.centre[there] - first.centre[here]
         return np.einsum("kij,kj->ki", first.rotation[here], step), []
-    note = f"The cameras {names} share no key frame: their centres are interpolated between key frames."
     if len(first.frame) == 1:  # a fixed camera
-        return (second.centre - first.centre[0]) @ first.rotation[0].T, [note]
-    inside = (first.frame >= second.frame[0]) & (first.frame <= second.frame[-1])
+        return (second.centre - first.centre[0]) @ first.rotation[0].T, []
     if len(second.frame) == 1:
-        inside[:] = True
-    if not inside.any():
+        return np.einsum("kij,kj->ki", first.rotation, second.centre - first.centre), []
+    rows, place = _between_keys(second, first.frame)
+    if not len(rows):
         raise InputError(
             f"The distance between the cameras {names} cannot be measured.",
             expected="key frames of both at the same time",
             found=f"frames {first.frame[0]}–{first.frame[-1]} and {second.frame[0]}–{second.frame[-1]}",
             remedy="name a distance between cameras that recorded together",
         )
-    frame = first.frame[inside]
-    other = np.stack([np.interp(frame, second.frame, axis) for axis in second.centre.T], axis=-1)
-    return np.einsum("kij,kj->ki", first.rotation[inside], other - first.centre[inside]), [note]
+    note = f"The cameras {names} share few key frames or none: places between key frames are interpolated."
+    return np.einsum("kij,kj->ki", first.rotation[rows], place - first.centre[rows]), [note]
+
+
+def _between_keys(camera: KeyedCamera, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of some frames (K,) lie between key frames that are no gap apart, and the centres there."""
+    from scipy.interpolate import CubicSpline
+
+    after = np.clip(np.searchsorted(camera.frame, frame), 1, len(camera.frame) - 1)
+    step = np.diff(camera.frame)
+    inside = (frame >= camera.frame[0]) & (frame <= camera.frame[-1])
+    rows = np.flatnonzero(inside & (step[after - 1] <= _GAP * np.median(step)))
+    if len(camera.frame) > 3:
+        return rows, CubicSpline(camera.frame, camera.centre)(frame[rows])
+    return rows, np.stack([np.interp(frame[rows], camera.frame, axis) for axis in camera.centre.T], axis=-1)
 
 
 def _one_frame(

@@ -23,6 +23,7 @@ from acino_fte.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from acino_fte.cameras import Camera
+    from acino_fte.data_tools.camera_keys import KeyedCamera
     from acino_fte.data_tools.camera_paths import CameraPath
     from acino_fte.data_tools.tracks2d import Tracks2D
 
@@ -166,6 +167,44 @@ def _checked(
     return names
 
 
+def keys_on_reference_clock(
+    camera: KeyedCamera, offset: float, drift: float = 0.0, middle: float = 0.0
+) -> KeyedCamera:
+    """Key frames of a camera in whole frames of the reference's clock.
+
+    Each goes to the nearest whole frame; for the part of a frame that is left, its pose moves towards that of
+    the next key frame (or on from the one before it, at the ends). Of two that fall on one frame the first
+    stays.
+
+    Parameters
+    ----------
+    camera : KeyedCamera
+        On its own clock.
+    offset, drift, middle : float
+        As in :class:`TimeOffsets`.
+    """
+    time = camera.frame + offset + drift * (camera.frame - middle)
+    frame, keep = np.unique(np.round(time).astype(int), return_index=True)
+    if len(camera.frame) == 1:
+        return replace(camera, frame=frame)
+    rest = own_time(frame, offset, drift, middle) - camera.frame[keep]
+    last = len(camera.frame) - 1
+    towards = np.where(rest >= 0, keep + 1, keep - 1)
+    towards = np.where(towards > last, last - 1, np.where(towards < 0, 1, towards))
+    part = rest / (camera.frame[towards] - camera.frame[keep])
+    start, end = camera.rotation[keep], camera.rotation[towards]
+    step = Rotation.from_matrix(end @ np.swapaxes(start, 1, 2)).as_rotvec()
+    rotation = Rotation.from_rotvec(part[:, None] * step).as_matrix() @ start
+    centre = camera.centre[keep] + part[:, None] * (camera.centre[towards] - camera.centre[keep])
+    return replace(
+        camera,
+        frame=frame,
+        rotation=rotation,
+        translation=-np.einsum("kij,kj->ki", rotation, centre),
+        covariance=None if camera.covariance is None else camera.covariance[keep],
+    )
+
+
 def to_reference_clock(
     tracks: Tracks2D, path: CameraPath, offset: float, drift: float = 0.0, middle: float = 0.0
 ) -> tuple[Tracks2D, CameraPath]:
@@ -185,7 +224,7 @@ def to_reference_clock(
     offset, drift, middle : float
         As in :class:`TimeOffsets`.
     """
-    return _tracks_at(tracks, offset, drift, middle), _path_at(path, offset, drift, middle)
+    return tracks_on_reference_clock(tracks, offset, drift, middle), _path_at(path, offset, drift, middle)
 
 
 def _nodes(first: int, last: int, offset: float, drift: float, middle: float) -> tuple[np.ndarray, ...]:
@@ -198,7 +237,10 @@ def _nodes(first: int, last: int, offset: float, drift: float, middle: float) ->
     return frame, before, np.where(part < 1e-8, 0.0, part)
 
 
-def _tracks_at(tracks: Tracks2D, offset: float, drift: float, middle: float) -> Tracks2D:
+def tracks_on_reference_clock(
+    tracks: Tracks2D, offset: float, drift: float = 0.0, middle: float = 0.0
+) -> Tracks2D:
+    """The tracks of :func:`to_reference_clock`."""
     if not len(tracks):
         return tracks
     frame, before, part = _nodes(int(tracks.frame.min()), int(tracks.frame.max()), offset, drift, middle)

@@ -178,13 +178,30 @@ def test_cameras_without_a_common_key_frame():
     for pair in ([a, b], [b, a]):
         found = measure_distance(KnownDistance("cameras", pair[0].name, pair[1].name, 1), pair)
         np.testing.assert_allclose(found.length, 0.5, rtol=1e-9)
-        assert "no key frame" in found.notes[0]
+        assert "few key frames or none" in found.notes[0]
     fixed = [keyed("a", [3], still[:1], x[:1]), keyed("b", [9], still[:1], x[:1] + [0, 0.7, 0], 2)]
     found = measure_distance(distance, fixed)
     np.testing.assert_allclose([found.length, found.sd], [0.7, 0.007])
+    assert "in one frame" in found.notes[0]
+    watcher = keyed("b", [7], still[:1], x[:1] + [1.9, 3.0, 0], 2)  # fixed, and the other one walks past it
+    found = measure_distance(distance, [a, watcher])
+    assert found.n == n
+    assert "not constant" in found.notes[0]
     late = keyed("b", range(100, 120), still, x[:n], 2)
     with pytest.raises(InputError, match="at the same time"):
         measure_distance(distance, [a, late])
+
+
+def test_a_rig_of_which_the_key_frames_lie_between_each_other():
+    a, b = rigid_pair(8, 400)
+    distance = KnownDistance("cameras", "cam_a", "cam_b", 1)
+    pair = [
+        keyed("cam_a", a.frame[::2], a.rotation[::2], a.centre[::2]),
+        keyed("cam_b", b.frame[1::2], b.rotation[1::2], b.centre[1::2], 2),
+    ]
+    found = measure_distance(distance, pair)
+    assert abs(found.length - 0.6) < 3 * found.sd < 3e-3
+    assert found.rigid
 
 
 def wand(seed: int, n: int = 400, length: float = 0.5, sway: float = 0.0):

@@ -5,10 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from acino_fte.cameras import Camera
+from acino_fte.data_tools.camera_keys import KeyedCamera
 from acino_fte.data_tools.camera_paths import CameraPath
 from acino_fte.data_tools.time_offsets import (
     TimeOffsets,
     estimate_time_offsets,
+    keys_on_reference_clock,
     own_time,
     to_reference_clock,
 )
@@ -142,6 +144,11 @@ def test_an_offset_out_of_reach_and_a_motion_that_repeats_are_told():
     assert "40 frames from the best one is almost as good" in found.notes[0]
 
 
+def test_nothing_moves_and_there_is_no_noise():
+    found = estimate_time_offsets(*record([0.0, 5.0], n=200, speed=0, flight=0, noise_px=0, swapped=0))
+    np.testing.assert_array_equal(found.observable, [True, False])
+
+
 def test_no_rows_at_all():
     paths, tracks, lenses = record([0.0, 1.0], n=50)
     empty = [view.at_rows(np.zeros(0, int)) for view in tracks]
@@ -203,6 +210,30 @@ def test_dots_and_poses_on_the_reference_clock_are_those_of_that_time():
     np.testing.assert_array_equal(moved.known, (inside < 24) | (inside > 26))
     assert tracks.frame.dtype == found.frame.dtype
     np.testing.assert_array_equal(tracks.xy, xy[order])  # the input stays
+
+
+def test_key_frames_on_the_reference_clock_are_those_of_that_time():
+    offset, drift, middle = -12.4, 1e-3, 50.0
+    frame = np.array([3, 11, 19, 27, 60, 61])
+    time = frame + offset + drift * (frame - middle)
+
+    def pose(t):
+        return Rotation.from_rotvec(np.outer(t, [0.01, 0.02, -0.005])).as_matrix(), np.outer(t, [0.1, 0, 0.2])
+
+    rotation, centre = pose(time)
+    translation = -np.einsum("nij,nj->ni", rotation, centre)
+    lens = Camera("a", "pinhole", MATRIX, DISTORTION, np.eye(3), np.zeros(3), SIZE)
+    camera = KeyedCamera("a", lens, 1, frame, rotation, translation, np.arange(216.0).reshape(6, 6, 6))
+    moved = keys_on_reference_clock(camera, offset, drift, middle)
+    np.testing.assert_array_equal(moved.frame, np.round(time))
+    rotation, centre = pose(moved.frame)
+    np.testing.assert_allclose(moved.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(moved.centre, centre, atol=1e-10)
+    np.testing.assert_array_equal(moved.covariance, camera.covariance)
+    crowded = keys_on_reference_clock(KeyedCamera("a", lens, 1, np.arange(6), *pose(np.arange(6))), 0.2, -0.4)
+    assert (np.diff(crowded.frame) > 0).all()
+    one = KeyedCamera("a", lens, 1, frame[:1], camera.rotation[:1], translation[:1])
+    assert keys_on_reference_clock(one, 2.6).frame.tolist() == [6]
 
 
 def test_a_whole_offset_only_renames_the_frames():
