@@ -34,7 +34,6 @@ _SINGULAR = 1e-13
 _NO_NOISE = 1e-16  # px²; residuals are those of a simulation without noise
 _MEDIAN_CHI2_6 = 5.348
 _ADJUSTED = 4.0  # steps that take more than this, against chance: the poses are not adjusted
-_GROSS_POSE = 20.0
 _MOST_IMAGES, _EM_STEPS, _EM_TOLERANCE = 1000, 100, 1e-3
 
 
@@ -124,8 +123,7 @@ def pose_errors(model: ColmapModel, min_observations: int = MIN_OBSERVATIONS) ->
     ratio = float(np.median(taken)) / (_MEDIAN_CHI2_6 * after)
     if ratio < _ADJUSTED:
         return PoseErrors(inverse * sigma**2 * max(1.0, ratio), sigma, adjusted=True)
-    kept = taken <= _GROSS_POSE * np.median(taken)
-    variances = _common_variances(normal[fixed][kept] / after, pull[fixed][kept] / after)
+    variances = _common_variances(normal[fixed] / after, pull[fixed] / after)
     common = np.diag(np.repeat(variances, 3))
     covariance = np.where(fixed[:, None, None], common, np.nan)
     return PoseErrors(covariance, float(np.sqrt(after)), adjusted=False)

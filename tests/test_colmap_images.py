@@ -279,7 +279,7 @@ def test_a_few_gross_poses_do_not_spoil_the_others():
     rng = np.random.default_rng(6)
     true = model(300, 25, seed=4, noise_px=0.5)
     error = rng.normal(0, np.repeat([2e-3, 8e-3], 3), (300, 6))
-    error[7::60] *= 12
+    error[7::30] *= 4.5
     result = pose_errors(moved_pose(true, error))
     sd = np.sqrt(np.diagonal(result.covariance[0]))
     np.testing.assert_allclose(sd, np.repeat([2e-3, 8e-3], 3), rtol=0.15)
