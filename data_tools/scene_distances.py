@@ -88,6 +88,46 @@ def between_cameras(first: KeyedCamera, second: KeyedCamera) -> MeasuredDistance
     return MeasuredDistance(found, sd, len(offset), spread, rigid and not warned, (*notes, *warned))
 
 
+def between_places(first: KeyedCamera, frame: int, second: KeyedCamera, other: int) -> MeasuredDistance:
+    """The distance between where a camera was in one key frame and where one was in another.
+
+    Its error comes from the covariances of the poses; without these from how rough the camera's path is, or
+    is a guess (1 %).
+
+    Raises
+    ------
+    InputError
+        A frame is no key frame of its camera.
+    """
+    place, variance = [], []
+    for camera, at in ((first, frame), (second, other)):
+        row = int(np.argmin(np.abs(camera.frame - at)))
+        if camera.frame[row] != at:
+            raise InputError(
+                f"Camera '{camera.name}' has no key frame {at}.",
+                expected=f"one of its {len(camera.frame)} key frames",
+                found=f"the nearest is {camera.frame[row]}",
+            )
+        place.append(camera.centre[row])
+        rough = [_fast_variance(axis) for axis in camera.centre.T]
+        variance.append(np.mean(rough) if camera.covariance is None else camera.covariance[row, 3:, 3:])
+    step = place[1] - place[0]
+    length = float(np.linalg.norm(step))
+    if not length > 0:
+        raise InputError(
+            "The two places of a known distance are one.", expected="a distance above 0", found="0"
+        )
+    unit = step / length
+    sd = float(
+        np.sqrt(sum(unit @ (one * np.eye(3) if np.ndim(one) == 0 else one) @ unit for one in variance))
+    )
+    notes: tuple[str, ...] = ()
+    if not (np.isfinite(sd) and sd > 0):
+        sd = _ONE_FRAME * length
+        notes = (f"The error of the distance {first.name}@{frame}–{second.name}@{other} is a guess (1 %).",)
+    return MeasuredDistance(length, sd, 1, 0.0, False, notes)
+
+
 def between_points(
     first: np.ndarray, second: np.ndarray, covariance: np.ndarray, names: str = "two points"
 ) -> MeasuredDistance:

@@ -1,9 +1,10 @@
 """The scale of a structure-from-motion model from known distances, with its uncertainty.
 
-A distance is between two cameras (the side of a rig) or two individuals (the ends of a wand, the length of a
-body). Each known length L and what the model measures for it, m, say the scale: log s = log L − log m. Their
-mean, weighted by the relative variances of both, is the scale; their scatter about it is a test. Nothing
-here depends on the gauge of the model.
+A distance is between two cameras (the side of a rig), two individuals (the ends of a wand, the length of a
+body), or two places on the way of cameras (surveyed, or from a satellite receiver). Each known length L and
+what the model measures for it, m, say the scale: log s = log L − log m. Their mean, weighted by the relative
+variances of both, is the scale; their scatter about it is a test. Nothing here depends on the gauge of the
+model.
 """
 
 from __future__ import annotations
@@ -15,19 +16,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acino_fte.data_tools.scene_distances import MeasuredDistance, between_cameras, between_points
+from acino_fte.data_tools.scene_distances import (
+    MeasuredDistance,
+    between_cameras,
+    between_places,
+    between_points,
+)
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:
     from acino_fte.data_tools.camera_keys import KeyedCamera
     from acino_fte.data_tools.scene_tracks import SceneTracks
 
+_KINDS = ("cameras", "individuals", "places")
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _LENGTH = re.compile(
     rf"\s*({_NUMBER})\s*(mm|cm|m)?\s*(?:(?:\+-|\+/-|±)\s*({_NUMBER})\s*(mm|cm|m)?)?\s*", re.IGNORECASE
 )
 _EXAMPLE = "FIRST-SECOND=LENGTH, as 1-3=0.6, cam_a:cam_b=60cm+-2mm or tracks:0-1=0.5"
+_PLACE = re.compile(r"(.+)@(\d+)")
 _P_ODD = 0.01  # chance of a scatter this large that is still believed
 
 
@@ -37,10 +45,10 @@ class KnownDistance:
 
     Attributes
     ----------
-    kind : {"cameras", "individuals"}
+    kind : {"cameras", "individuals", "places"}
     first, second : str
-        Names. `second` is empty while `first` holds both in a text with several dashes; :func:`resolve`
-        tells them apart.
+        Names; of places NAME@FRAME. `second` is empty while `first` holds both in a text with several dashes;
+        :func:`resolve` tells them apart.
     length : float
         m.
     sd : float
@@ -54,9 +62,9 @@ class KnownDistance:
     sd: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in ("cameras", "individuals"):
+        if self.kind not in _KINDS:
             raise InputError(
-                "A distance is of an unknown kind.", expected="cameras or individuals", found=repr(self.kind)
+                "A distance is of an unknown kind.", expected=", ".join(_KINDS), found=repr(self.kind)
             )
         possible = np.isfinite([self.length, self.sd]).all() and self.length > 0 and self.sd >= 0
         if not possible or self.sd >= self.length:
@@ -75,7 +83,8 @@ def parse_distance(text: str) -> KnownDistance:
     """A known distance as it is written on the command line.
 
     ``1-3=0.6``, ``left:right=0.537``, ``cam_a-cam_b=60cm+-2mm`` (also ± or +/-) are between cameras,
-    ``tracks:0-1=0.5`` is between individuals. Units are m (the default), cm and mm; one unit is enough for
+    ``tracks:0-1=0.5`` is between individuals, ``left@0:left@190=22.7`` between where a camera was in two of
+    its key frames. Units are m (the default), cm and mm; one unit is enough for
     length and standard deviation.
 
     Raises
@@ -116,7 +125,7 @@ def resolve(
     """The distance with the full names of what it is between.
 
     A camera is meant by its name, or by the number of its camera in the COLMAP model (``3`` or ``#3``) when
-    no other camera shares that; ``@3`` is always the name "3".
+    no other camera shares that; ``@3`` is always the name "3". ``3@120`` is where it was in key frame 120.
 
     Parameters
     ----------
@@ -132,8 +141,16 @@ def resolve(
     InputError
         A name is unknown or means several; the message lists what there is.
     """
-    known = _camera_words(cameras) if distance.kind == "cameras" else {name: {name} for name in individuals}
+    known = {name: {name} for name in individuals}
+    if distance.kind != "individuals":
+        known = _camera_words(cameras)
     ways = [(distance.first, distance.second)] if distance.second else _splits(distance.first)
+    frames = {}
+    if distance.kind != "individuals":
+        frames = {word: _PLACE.fullmatch(word) for way in ways for word in way if word not in known}
+        for word, match in frames.items():
+            if match and match[1] in known:
+                known[word] = {f"{name}@{match[2]}" for name in known[match[1]]}
     found = [way for way in ways if way[0] in known and way[1] in known]
     if len(found) != 1:
         raise _unclear(distance, found, [word for way in ways for word in way if word not in known], known)
@@ -148,7 +165,13 @@ def resolve(
         ends += known[word]
     if ends[0] == ends[1]:
         raise InputError(f"The known distance {distance} is from '{ends[0]}' to itself.", expected="two ends")
-    return replace(distance, first=ends[0], second=ends[1])
+    n_places = sum(word in frames for word in found[0])
+    if n_places == 1:
+        raise InputError(
+            f"The known distance {distance} has one end with a frame and one without.",
+            expected="NAME@FRAME:NAME@FRAME, or two names",
+        )
+    return replace(distance, kind="places" if n_places else distance.kind, first=ends[0], second=ends[1])
 
 
 def _camera_words(cameras: Sequence[KeyedCamera]) -> dict[str, set[str]]:
@@ -174,7 +197,7 @@ def _unclear(
             found=" or ".join(f"{first} : {second}" for first, second in found),
             remedy=f"put a colon between the two names: {found[0][0]}:{found[0][1]}",
         )
-    what = "cameras" if distance.kind == "cameras" else "individuals"
+    what = "individuals" if distance.kind == "individuals" else "cameras"
     return InputError(
         f"The known distance {distance} names {what} that are not there.",
         expected=f"two of {listed}",
@@ -204,6 +227,11 @@ def measure_distance(
     if distance.kind == "cameras":
         ends = {camera.name: camera for camera in cameras}
         return between_cameras(ends[distance.first], ends[distance.second])
+    if distance.kind == "places":
+        by_name = {camera.name: camera for camera in cameras}
+        places = [word.rpartition("@") for word in (distance.first, distance.second)]
+        (here, _, one), (there, _, other) = places
+        return between_places(by_name[here], int(one), by_name[there], int(other))
     if tracks is None:
         raise InputError(f"The known distance {distance} needs tracks.", expected="triangulated tracks")
     chosen = []

@@ -204,6 +204,26 @@ def test_a_rig_of_which_the_key_frames_lie_between_each_other():
     assert found.rigid
 
 
+def test_two_places_of_a_camera():
+    cameras = rigid_pair(9)
+    a = cameras[0]
+    known = resolve(parse_distance(f"7@{a.frame[3]}:cam_a@{a.frame[90]}=4.4"), cameras)
+    assert (known.kind, known.first) == ("places", f"cam_a@{a.frame[3]}")
+    found = measure_distance(known, cameras)
+    np.testing.assert_allclose(found.length, np.linalg.norm(a.centre[90] - a.centre[3]), rtol=1e-12)
+    assert 0.5 < found.sd / (0.004 * np.sqrt(2)) < 2
+    sure = KeyedCamera(
+        "cam_a", a.lens, 7, a.frame, a.rotation, a.translation, np.tile(np.eye(6), (len(a.frame), 1, 1))
+    )
+    np.testing.assert_allclose(measure_distance(known, [sure]).sd, np.sqrt(2))
+    with pytest.raises(InputError, match="one end with a frame"):
+        resolve(parse_distance("7@0-8=1"), cameras)
+    with pytest.raises(InputError, match=r"no key frame 3[\s\S]*nearest is"):
+        measure_distance(resolve(parse_distance("7@3-8@16=1"), cameras), cameras)
+    with pytest.raises(InputError, match="not there"):
+        resolve(parse_distance("dog@3-8@16=1"), cameras)
+
+
 def wand(seed: int, n: int = 400, length: float = 0.5, sway: float = 0.0):
     """Two ends of a wand that turns, their covariances (deep in z), and the truth."""
     rng = np.random.default_rng(seed)
