@@ -26,6 +26,7 @@ _NEWTON_STEPS, _DAMPED_STEPS = 6, 60
 _EXACT, _CLOSE = 1e-13, 1e-11  # of the distorted normalised coordinates: where to stop, and what will do
 _NO_INTRINSICS = np.array([1.0, 1.0, 0.0, 0.0])
 _BLOCK = 4096  # values that a program works on at a time: three times faster than 30,000
+_SHARP = 1e-6  # of a division lens' fold, where one rounding of the ray moves the pixel by 1e-6 px and more
 _LAST, _STEEP = 1e-8, 0.1  # a step from this near, this far from a fold, is exact
 _FROM_FOLD = 0.9  # a start at the very fold would have no step to take
 _SEAM = 1e-9  # rad; the rounding allowed at the borders of a panorama
@@ -94,7 +95,7 @@ def closed_directions(model: str, parameters: np.ndarray, bent: np.ndarray) -> n
         if model == "equirectangular":
             inside = (np.abs(a) <= np.pi + _SEAM) & (np.abs(b) <= 0.5 * np.pi + _SEAM)
         elif model == "division":
-            inside = coefficients[0] * (a**2 + b**2) < 1
+            inside = coefficients[0] * (a**2 + b**2) < 1 - _SHARP
         elif model == "fov":
             inside = np.hypot(a, b) * abs(coefficients[0]) < 0.5 * np.pi
         else:
@@ -251,9 +252,9 @@ def _pole(model: str, k: np.ndarray) -> float:
     """
     if model != "pinhole" or not k[5:8].any():
         return np.inf
-    roots = np.roots([*k[7:4:-1], 1.0])
-    squares = roots[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)].real
-    return float(np.arctan(np.sqrt(squares.min()))) * (1 - 1e-9) if len(squares) else np.inf
+    roots = np.roots([1.0, *k[5:8]])  # of 1/r²: no division by a coefficient near zero
+    inverse = roots[(np.abs(roots.imag) <= 1e-6 * np.abs(roots)) & (roots.real > 0)].real
+    return float(np.arctan(1.0 / np.sqrt(inverse.max()))) * (1 - 1e-9) if len(inverse) else np.inf
 
 
 def _bend(model: str, chart: np.ndarray, coefficients: np.ndarray) -> np.ndarray:

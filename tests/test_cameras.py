@@ -192,6 +192,27 @@ def test_beyond_the_valid_field_is_nan(model, distortion):
     assert (np.arctan(np.hypot(ideal[:, 0], ideal[:, 1])) < camera.valid_angle).all()
 
 
+@pytest.mark.parametrize("tiny", [5e-324, -5e-324, 1e-200, 1e-12])
+def test_coefficients_next_to_nothing(tiny):
+    plain = look_at("c", [0.0, -4.0, 1.0], [0.0, 0.0, 1.0], distortion=np.array(LARGEST[:5]))
+    for at in (5, 6, 7, 11):
+        lens = np.array([*LARGEST[:5], *[0.0] * 7])
+        lens[at] = tiny
+        camera = replace(plain, distortion=lens)
+        assert camera.valid_angle == pytest.approx(plain.valid_angle, rel=1e-6)
+        assert np.allclose(
+            camera.undistort(np.array([100.0, 50.0])), plain.undistort(np.array([100.0, 50.0]))
+        )
+
+
+def test_the_field_ends_before_the_pole_of_a_rational_lens():
+    """Numerator and denominator change sign side by side: a fold too narrow to be sampled."""
+    for numerator, denominator in ((-0.25, -0.2501), (-0.2501, -0.25)):
+        lens = [numerator, 0, 0, 0, 0, denominator, 0, 0]
+        camera = look_at("c", [0.0, -4.0, 1.0], [0.0, 0.0, 1.0], distortion=np.array(lens))
+        assert np.tan(camera.valid_angle) <= 2.0
+
+
 def test_nan_pixels_stay_nan():
     camera = look_at("c", [0.0, -4.0, 1.0], [0.0, 0.0, 1.0], "fisheye")
     pixels = np.array([[[np.nan, np.nan], [500.0, 300.0], [500.0, np.nan]]])
