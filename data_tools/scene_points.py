@@ -17,6 +17,8 @@ from acino_fte.data_tools.scene_noise import (
     NOISE_FLOOR,
     PointInformation,
     SceneNoise,
+    determinant_3x3,
+    inverse_3x3,
     median_of_chi2,
     sum_of_each,
 )
@@ -81,15 +83,22 @@ def triangulate_points(rows: SceneRows, views: Views, noise_px: float | None = N
 def retriangulate(rows: SceneRows, views: Views, fit: PointFit, used: np.ndarray) -> PointFit:
     """The same with other dots (P,) that count."""
     used = used & (np.bincount(rows.point[used], minlength=rows.n_points)[rows.point] >= 2)
-    position = refine(rows, nearest_points(rows, used), used)
-    position, covariance = PointInformation(rows, views, position, used).solve(fit.noise)
+    changed = np.bincount(rows.point[used != fit.used], minlength=rows.n_points) > 0
+    if not changed.any():
+        return fit
+    some, dots = rows.of_points(changed)
+    found = refine(some, nearest_points(some, used[dots]), used[dots])
+    position, covariance = fit.position.copy(), fit.covariance.copy()
+    information = PointInformation(some, views, found, used[dots])
+    position[changed], covariance[changed] = information.solve(fit.noise)
     return PointFit(position, covariance, used & np.isfinite(position[rows.point, 0]), fit.noise)
 
 
 def nearest_points(rows: SceneRows, used: np.ndarray) -> np.ndarray:
     """Points (T, 3) nearest to all rays, NaN without two that meet in front of their cameras."""
-    origin, direction = rows.measured.rays()
-    return _nearest(origin[used], direction[used], rows.point[used], rows.n_points)
+    dots = np.flatnonzero(used)
+    origin, direction = rows.measured.subset(dots, rows.point[dots]).rays()
+    return _nearest(origin, direction, rows.point[dots], rows.n_points)
 
 
 def _nearest(origin: np.ndarray, direction: np.ndarray, point: np.ndarray, n_points: int) -> np.ndarray:
@@ -101,9 +110,9 @@ def _nearest(origin: np.ndarray, direction: np.ndarray, point: np.ndarray, n_poi
         each = weight[:, None, None] * np.concatenate([across, across @ origin[..., None]], axis=2)
         total = sum_of_each(each, point, n_points)
         scale = np.trace(total[..., :3], axis1=1, axis2=2) / 3.0
-        met = (count >= 2) & (np.linalg.det(total[..., :3]) > _PARALLEL * scale**3) & (scale > 0)
+        met = (count >= 2) & (determinant_3x3(total[..., :3]) > _PARALLEL * scale**3) & (scale > 0)
         position[:] = np.nan
-        position[met] = np.linalg.solve(total[met][..., :3], total[met][..., 3:])[..., 0]
+        position[met] = (inverse_3x3(total[met][..., :3]) @ total[met][..., 3:])[..., 0]
         ahead = ((position[point] - origin) * direction).sum(1)
         weight = np.where(ahead > 0, 1.0 / np.maximum(ahead, 1e-12) ** 2, 0.0)
     return position
@@ -124,9 +133,9 @@ def _solve(information: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     """Steps (T, 3); NaN where the information is singular."""
     scale = np.trace(information, axis1=1, axis2=2) / 3.0
     with np.errstate(invalid="ignore"):
-        firm = np.linalg.det(information) > 1e-12 * scale**3
+        firm = determinant_3x3(information) > 1e-12 * scale**3
     step = np.full(gradient.shape, np.nan)
-    step[firm] = np.linalg.solve(information[firm], gradient[firm][..., None])[..., 0]
+    step[firm] = (inverse_3x3(information[firm]) @ gradient[firm][..., None])[..., 0]
     return step
 
 
@@ -167,23 +176,22 @@ def _consensus(
         doubtful = (freedom > 0) & ~(misfit <= variance * _limit(freedom))
     if not doubtful.any():
         return used, position
-    chosen = np.flatnonzero(doubtful[rows.point] & used)
-    inlier = np.zeros(len(chosen), dtype=bool)
-    point = rows.point[chosen]
-    order = np.argsort(point, kind="stable")
-    count = np.bincount(point, minlength=rows.n_points)[np.unique(point)]
-    for n in np.unique(count):
+    some, dots = rows.of_points(doubtful)
+    right = np.zeros(len(dots), dtype=bool)
+    count = np.bincount(some.point, minlength=some.n_points)
+    order = np.argsort(some.point, kind="stable")
+    for n in np.unique(count[count > 2]):
         block = order[np.repeat(count == n, count)].reshape(-1, n)
-        if n > 2:
-            inlier[block] = _vote(rows, chosen[block], variance)
-    used = used.copy()
-    used[chosen] = inlier
-    used &= np.bincount(rows.point[used], minlength=rows.n_points)[rows.point] >= 2
-    again = refine(rows, np.where(doubtful[:, None], nearest_points(rows, used), position), used)
-    misfit, freedom = _misfit(rows, again, used)
+        right[block] = _vote(some, block, variance)
+    right &= np.bincount(some.point[right], minlength=some.n_points)[some.point] >= 2
+    found = refine(some, nearest_points(some, right), right)
+    misfit, freedom = _misfit(some, found, right)
     with np.errstate(invalid="ignore"):
-        again[doubtful & ~(misfit <= variance * _limit(freedom))] = np.nan
-    return used & np.isfinite(again[rows.point, 0]), again
+        found[~(misfit <= variance * _limit(freedom))] = np.nan
+    position, used = position.copy(), used.copy()
+    position[doubtful] = found
+    used[dots] = right & np.isfinite(found[some.point, 0])
+    return used, position
 
 
 def _vote(rows: SceneRows, block: np.ndarray, variance: float) -> np.ndarray:

@@ -93,6 +93,16 @@ class SceneRows:
         """T."""
         return len(self.frame)
 
+    def of_points(self, chosen: np.ndarray) -> tuple[SceneRows, np.ndarray]:
+        """Some of the points, (T,) bool, with their dots, and which dots these are."""
+        dots = np.flatnonzero(chosen[self.point])
+        number = np.cumsum(chosen) - 1
+        measured = self.measured.subset(dots, number[self.point[dots]])
+        rows = SceneRows(
+            self.camera[dots], self.place[dots], self.individual[chosen], self.frame[chosen], measured
+        )
+        return rows, dots
+
 
 def scene_rows(views: Views, tracks: Sequence[Tracks2D], individuals: Sequence[str]) -> SceneRows:
     """Gather the dots of all cameras; individuals are joined by their names.
