@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import typer
 
-from acino_fte import cli_compare, cli_match, cli_run, cli_scene, cli_simulate, cli_skeleton
+from acino_fte import (
+    cli_compare,
+    cli_match,
+    cli_run,
+    cli_scene,
+    cli_simulate,
+    cli_simulate_scene,
+    cli_skeleton,
+)
 
 app = typer.Typer(
     name="acino-fte",
@@ -18,6 +26,7 @@ app.command("compare")(cli_compare.compare)
 app.command("match")(cli_match.match)
 app.command("scene")(cli_scene.scene)
 app.command("simulate")(cli_simulate.simulate)
+app.command("simulate-scene")(cli_simulate_scene.simulate_scene)
 app.add_typer(cli_skeleton.app, name="skeleton")
 
 

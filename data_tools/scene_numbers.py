@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from acino_fte.data_tools.scene_truth import SceneTruth
 
 TRIANGULATED, NOTHING = "triangulated", "nothing_triangulated"
+_OWN_AXES = "the model's own axes"  # as scene_axes says it
 MOST_PAIRS = 15
 """Distances between individuals are listed when there are no more pairs than this."""
 
@@ -218,6 +219,12 @@ def summary(metrics: dict[str, Any]) -> list[str]:
     return lines
 
 
+def upright_by(metrics: dict[str, Any]) -> str | None:
+    """What the scene is upright by; None when its axes are those of the model."""
+    how = (metrics["axes"] or {}).get("how")
+    return None if how in (None, _OWN_AXES) else str(how)
+
+
 def _count(n: int, word: str) -> str:
     return f"{n} {word}" + ("" if n == 1 else "s")
 
@@ -240,8 +247,8 @@ def _world(metrics: dict[str, Any]) -> list[str]:
         lines.append(f"scale {scale['factor']:.5g} m per unit of the model{share}")
     else:
         lines.append("no scale: lengths are in units of the model (give a distance with --scale)")
-    how = (metrics["axes"] or {}).get("how")
-    lines.append(f"upright by {how}" if how and how != "none" else "axes as in the model, not upright")
+    how = upright_by(metrics)
+    lines.append(f"upright by {how}" if how else "axes as in the model, not upright")
     return lines
 
 

@@ -18,6 +18,7 @@ from acino_fte.data_tools.page_parts import (
     write_page,
 )
 from acino_fte.data_tools.scene_drawing import thinned
+from acino_fte.data_tools.scene_numbers import upright_by
 from acino_fte.data_tools.scene_tracks import SOURCES, SceneTracks
 from acino_fte.data_tools.scene_viewer import viewer_html
 from acino_fte.report_scene import ground_grid
@@ -155,15 +156,11 @@ def _cloud(result: SceneResult) -> dict[str, Any] | None:
     return {"xyz": thinned(cloud.xyz, _MOST_CLOUD), "rgb": rgb}
 
 
-def _upright(metrics: dict[str, Any]) -> bool:
-    return (metrics["axes"] or {}).get("how", "none") != "none"
-
-
 def _colour(metrics: dict[str, Any]) -> str:
     """``green`` for tracks in metres and upright, ``amber`` for others, ``red`` without any."""
     if not metrics["n_points"]["all"]:
         return "red"
-    return "green" if metrics["scale"] and _upright(metrics) else "amber"
+    return "green" if metrics["scale"] and upright_by(metrics) else "amber"
 
 
 def _headline(metrics: dict[str, Any]) -> str:
@@ -176,7 +173,7 @@ def _headline(metrics: dict[str, Any]) -> str:
 def _advice(metrics: dict[str, Any]) -> str:
     if not metrics["n_points"]["all"]:
         return "Check that tracks and images have the same frame numbers, and that two cameras see one place."
-    upright = "z is up" if _upright(metrics) else "the axes are those of the model, z need not be up"
+    upright = "z is up" if upright_by(metrics) else "the axes are those of the model, z need not be up"
     if metrics["scale"]:
         return f"Lengths are in metres; {upright}."
     return f"There is no scale: lengths are in units of the model, not metres; {upright}."
