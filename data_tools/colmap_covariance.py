@@ -9,7 +9,7 @@ That holds for poses at the minimum of their residuals, where bundle adjustment 
 and Newton, δ = (Σ JᵀJ)⁻¹ Σ Jᵀr, are small there. Where they are larger than chance makes them (a robust loss,
 rounded files), the covariance grows by as much. Poses from elsewhere (another sensor, a filter) are far from
 the minimum, and the steps themselves say how wrong they are: δ ~ N(0, D + σ² (Σ JᵀJ)⁻¹), with one variance of
-turns and one of shifts in D for all images.
+turns and one of shifts in D for all images. With D as prior, the most probable step mends such poses.
 
 Shapes: I images, K observations.
 """
@@ -81,11 +81,17 @@ class PoseErrors:
         Standard deviation of an observed coordinate; NaN where the residuals do not say it.
     adjusted : bool
         Whether the poses are at the minimum of their residuals.
+    step : (I, 6)
+        The most probable error of each pose; 0 for poses that are adjusted, and where it is not known.
+    after_step : (I, 6, 6)
+        Covariance of the poses with the step taken.
     """
 
     covariance: np.ndarray
     noise_px: float
     adjusted: bool
+    step: np.ndarray
+    after_step: np.ndarray
 
 
 def pose_covariances(model: ColmapModel, min_observations: int = MIN_OBSERVATIONS) -> np.ndarray:
@@ -112,21 +118,42 @@ def pose_errors(model: ColmapModel, min_observations: int = MIN_OBSERVATIONS) ->
     normal, pull, count, rest = _normal_equations(model, residual, _GROSS * sigma)
     inverse = _inverses(normal, count >= min_observations)
     fixed = np.isfinite(inverse).all(axis=(1, 2))
-    step = np.einsum("nij,nj->ni", inverse[fixed], pull[fixed])
-    taken = np.einsum("ni,ni->n", step, pull[fixed])  # of the sum of squares by a step
+    taken = np.einsum("ni,nij,nj->n", pull[fixed], inverse[fixed], pull[fixed])  # of Σ r² by each step
     freedoms = 2 * count.sum() - _freedoms(model, residual)
     if not fixed.any() or not freedoms > 0:
-        return PoseErrors(inverse * np.nan, sigma, adjusted=True)
+        return _as_adjusted(inverse * np.nan, sigma)
     after = (rest - taken.sum()) / freedoms
     if after < _NO_NOISE:
-        return PoseErrors(inverse * sigma**2, sigma, adjusted=True)
+        return _as_adjusted(inverse * sigma**2, sigma)
     ratio = float(np.median(taken)) / (_MEDIAN_CHI2_6 * after)
     if ratio < _ADJUSTED:
-        return PoseErrors(inverse * sigma**2 * max(1.0, ratio), sigma, adjusted=True)
-    variances = _common_variances(normal[fixed] / after, pull[fixed] / after)
-    common = np.diag(np.repeat(variances, 3))
-    covariance = np.where(fixed[:, None, None], common, np.nan)
-    return PoseErrors(covariance, float(np.sqrt(after)), adjusted=False)
+        return _as_adjusted(inverse * sigma**2 * max(1.0, ratio), sigma)
+    information, pull = normal[fixed] / after, pull[fixed] / after
+    variances = np.repeat(_common_variances(information, pull), 3)
+    covariance, left, step = (
+        np.full(normal.shape, np.nan),
+        np.full(normal.shape, np.nan),
+        np.zeros((len(fixed), 6)),
+    )
+    covariance[fixed] = np.diag(variances)
+    left[fixed] = np.linalg.inv(information + np.diag(1.0 / variances))
+    step[fixed] = np.einsum("nij,nj->ni", left[fixed], pull)
+    return PoseErrors(covariance, float(np.sqrt(after)), False, step, left)
+
+
+def _as_adjusted(covariance: np.ndarray, noise_px: float) -> PoseErrors:
+    return PoseErrors(covariance, noise_px, True, np.zeros(covariance.shape[:2]), covariance)
+
+
+def mended(model: ColmapModel, errors: PoseErrors) -> ColmapModel:
+    """The model with the steps of its poses taken; an adjusted one as it is."""
+    from scipy.spatial.transform import Rotation
+
+    if errors.adjusted:
+        return model
+    rotation = Rotation.from_rotvec(errors.step[:, :3]).as_matrix() @ model.rotation
+    centre = errors.step[:, 3:] - np.einsum("nji,nj->ni", model.rotation, model.translation)
+    return replace(model, rotation=rotation, translation=-np.einsum("nij,nj->ni", rotation, centre))
 
 
 def _normal_equations(

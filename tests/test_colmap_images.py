@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from acino_fte.cameras import Camera
 from acino_fte.data_tools.colmap import ColmapModel, read_colmap
 from acino_fte.data_tools.colmap_covariance import (
+    mended,
     pose_covariances,
     pose_errors,
     pose_slope,
@@ -246,7 +247,7 @@ def test_poses_that_were_adjusted(kind):
     true = model(60, 15, seed=3, cameras={1: lens(kind)}, noise_px=0.7)
     found = adjusted(true)
     result = pose_errors(found)
-    assert result.adjusted
+    assert result.adjusted and mended(found, result) is found
     # the points are exact here, but counted as estimated: 3 freedoms each too many
     counted = 2 * len(true.observed_xy) - 6 * 60
     exact = result.noise_px * np.sqrt((counted - 3 * 15 + 7) / counted)
@@ -273,6 +274,9 @@ def test_poses_from_elsewhere(kind, gross):
     np.testing.assert_allclose(sd, np.repeat(sizes, 3), rtol=0.12)
     assert 0.8 < nees(errors(found, true), result.covariance) < 1.3
     assert result.noise_px == pytest.approx(0.5, rel=0.15)
+    better = errors(mended(found, result), true)
+    assert nees(better, result.after_step) == pytest.approx(1.0, abs=0.25)
+    assert (better.std(0) < 0.8 * errors(found, true).std(0)).all()
 
 
 def test_a_few_gross_poses_do_not_spoil_the_others():
@@ -368,6 +372,9 @@ def test_rigs_of_mvt_know_their_noise(folder):
     np.testing.assert_allclose(np.degrees(sd[:3]), 0.03, rtol=0.1)
     np.testing.assert_allclose(sd[3:] / scale, 0.002, rtol=0.1)
     assert 0.9 < nees(errors(m, truth), result.covariance) < 1.15
+    better = errors(mended(m, result), truth)
+    assert 0.85 < nees(better, result.after_step) < 1.15
+    assert (better.std(0) < 0.72 * errors(m, truth).std(0)).all()
 
 
 def true_poses(m: ColmapModel, frames: ImageFrames, folder: Path) -> ColmapModel:
