@@ -314,6 +314,9 @@ def _triangulated(folder: Path, given: SceneOptions, tell: Callable[[str], None]
         cm_per_pixel=given.cm_per_pixel,
         dense=given.dense,
     )
+    if given.time_offsets:
+        tell("clocks")
+        found = found.synchronised()
     tell("scale and axes")
     found = found.placed(scale=given.scale or (), gravity=given.gravity or "cameras")
     return found.triangulate(given.rig, smooth=given.smooth, noise_px=given.noise_px, tell=tell, **gaps)

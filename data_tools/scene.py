@@ -39,6 +39,7 @@ from acino_fte.errors import InputError
 if TYPE_CHECKING:
     from acino_fte.data_tools.scene_axes import AxesEstimate
     from acino_fte.data_tools.scene_scale import KnownDistance, ScaleEstimate
+    from acino_fte.data_tools.time_offsets import TimeOffsets
 
 _GAP_S, _GAP = 1.0, 30  # longest gap of a track that is filled: seconds, or frames
 Tell = Callable[[str], None]
@@ -62,6 +63,8 @@ class Scene:
         Where the metres come from; without it lengths are in units of the model.
     axes : AxesEstimate, optional
         Where up comes from; without it the axes are those of the model.
+    clocks : TimeOffsets, optional
+        How the cameras' clocks were brought together; without it frames with one number are of one time.
     fps : float, optional
         Frames per second.
     warnings : tuple of str
@@ -75,6 +78,7 @@ class Scene:
     world_from_model: Similarity = field(default_factory=Similarity)
     scale: ScaleEstimate | None = None
     axes: AxesEstimate | None = None
+    clocks: TimeOffsets | None = None
     fps: float | None = None
     warnings: tuple[str, ...] = ()
 
@@ -182,6 +186,50 @@ class Scene:
             cameras=tuple(camera.moved(change) for camera in self.cameras),
             cloud=self.cloud.moved(change),
             world_from_model=change @ self.world_from_model,
+        )
+
+    def synchronised(
+        self, *, reference: str | None = None, max_offset: int = 90, drift: bool = True
+    ) -> Scene:
+        """The scene on one clock: offsets and drifts of the cameras are estimated from the individuals.
+
+        Dots and key frames of the other cameras are moved to whole frames of the reference camera, between
+        consecutive frames only.
+
+        Parameters
+        ----------
+        reference : str, optional
+            The camera whose clock counts.
+        max_offset : int
+            Greatest offset that is looked for, frames.
+        drift : bool
+            Whether clocks may run at different rates.
+
+        Raises
+        ------
+        InputError
+            The reference is not there, or there is one camera only.
+        """
+        from acino_fte.data_tools.time_offsets import (
+            estimate_time_offsets,
+            keys_on_reference_clock,
+            tracks_on_reference_clock,
+        )
+
+        paths = self.camera_paths("none").paths
+        lenses = [camera.lens for camera in self.cameras]
+        clocks = estimate_time_offsets(
+            paths, self.tracks, lenses, reference=reference, max_offset=max_offset, drift=drift
+        )
+        shifts = [
+            (float(o), float(d), clocks.middle) for o, d in zip(clocks.offset, clocks.drift, strict=True)
+        ]
+        return replace(
+            self,
+            cameras=tuple(keys_on_reference_clock(c, *s) for c, s in zip(self.cameras, shifts, strict=True)),
+            tracks=tuple(tracks_on_reference_clock(t, *s) for t, s in zip(self.tracks, shifts, strict=True)),
+            clocks=clocks,
+            warnings=(*self.warnings, *clocks.notes),
         )
 
     def placed(self, scale: Sequence[KnownDistance | str] = (), gravity: Path | str = "cameras") -> Scene:
@@ -324,7 +372,23 @@ class Scene:
             "axes": None
             if self.axes is None
             else {"how": self.axes.how, "tilt_sd_deg": float(np.degrees(self.axes.tilt_sd))},
+            "time_offsets": None if self.clocks is None else _clock_numbers(self.clocks),
         }
+
+
+def _clock_numbers(clocks: TimeOffsets) -> dict[str, Any]:
+    return {
+        "reference": clocks.reference,
+        "cameras": {
+            name: {
+                "offset_frames": float(clocks.offset[c]),
+                "offset_sd": float(clocks.offset_sd[c]),
+                "drift_ppm": 1e6 * float(clocks.drift[c]),
+                "drift_ppm_sd": 1e6 * float(clocks.drift_sd[c]),
+            }
+            for c, name in enumerate(clocks.names)
+        },
+    }
 
 
 def _scale_numbers(scale: ScaleEstimate) -> dict[str, Any]:
