@@ -18,7 +18,7 @@ from functools import cache, lru_cache
 
 import numpy as np
 
-from acino_fte.projection import COEFFICIENTS, EQUIDISTANT, INTRINSICS, programs
+from acino_fte.projection import COEFFICIENTS, EQUIDISTANT, INTRINSICS, SHORT, programs
 
 _RADII, _SECTORS, _START = 500, 96, 2000
 _WIDEST = {False: np.radians(89.9), True: 0.5 * np.pi - 1e-6}  # of a plane chart, of an equidistant one
@@ -45,6 +45,8 @@ def run(
     shape = columns[0].shape
     flat = [column.reshape(-1) for column in columns]
     values = parameters.tolist()
+    if model == "pinhole" and name != "project" and not any(values[len(INTRINSICS) + SHORT :]):
+        name = f"{name}_{SHORT}"
     out = np.empty((n_out, flat[0].size))
     with np.errstate(all="ignore"):
         for i in range(0, flat[0].size, _BLOCK):

@@ -30,6 +30,8 @@ The last three see beyond 90° from the axis: ``division`` with k < 0, ``eucm`` 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,6 +55,7 @@ COEFFICIENTS = {
 INTRINSICS = ("fx", "fy", "cx", "cy")
 CLOSED = ("fov", "division", "eucm", "equirectangular")  # models with :func:`direction`; others have `bend`
 EQUIDISTANT = ("fisheye", "thin_prism_fisheye", "rad_tan_thin_prism_fisheye")  # they bend (p, q), not (a, b)
+SHORT = 5  # coefficients of the usual pinhole lens, k1 k2 p1 p2 k3
 _TINY = 1e-18  # added to r² so that θ/r and the like have their limit, one, on the optical axis
 
 
@@ -72,12 +75,19 @@ def _coefficients(model: str) -> dict[str, sp.Symbol]:
     return dict(zip(COEFFICIENTS[model], parameter_symbols(model)[4:], strict=True))
 
 
-def bend(model: str, a: sp.Expr, b: sp.Expr, square: sp.Expr | None = None) -> tuple[sp.Expr, sp.Expr]:
+def bend(
+    model: str,
+    a: sp.Expr,
+    b: sp.Expr,
+    square: sp.Expr | None = None,
+    lens: dict[str, sp.Expr] | None = None,
+) -> tuple[sp.Expr, sp.Expr]:
     """Distorted (a', b') of (a, b), or of (p, q) for a model of :data:`EQUIDISTANT`.
 
-    ``square`` is a² + b², or θ²; it may be given where it is known already.
+    ``square`` is a² + b², or θ²; it may be given where it is known already. ``lens`` has other values for the
+    coefficients, such as zeros.
     """
-    k = _coefficients(model)
+    k = lens or _coefficients(model)
     r2 = a**2 + b**2 if square is None else square
     if model == "pinhole":
         up = 1 + r2 * (k["k1"] + r2 * (k["k2"] + r2 * k["k3"]))
@@ -170,7 +180,8 @@ def programs(model: str) -> dict[str, Program]:
     ``project``: (X, Y, Z, parameters) → u, v.  ``jacobian``: the same, then ∂u/∂X, ∂u/∂Y, ∂u/∂Z, ∂v/∂X, ….
     ``direction``, for models of :data:`CLOSED`: (a', b', parameters) → X, Y, Z of any length.
     ``bend``, for the others: (a, b, parameters) → a', b', ∂a'/∂a, ∂a'/∂b, ∂b'/∂a, ∂b'/∂b, with p, q in the
-    place of a, b for those of :data:`EQUIDISTANT`.
+    place of a, b for those of :data:`EQUIDISTANT`.  ``jacobian_5`` and ``bend_5``, for pinhole: the same with
+    half the work, for lenses whose coefficients beyond the first :data:`SHORT` are zero.
     """
     return cached_programs(f"camera-{model}", (Path(__file__), model), lambda: _derive(model))
 
@@ -178,50 +189,57 @@ def programs(model: str) -> dict[str, Program]:
 def _derive(model: str) -> dict[str, Program]:
     import sympy as sp
 
-    point = sp.symbols("X Y Z", real=True)
-    parameters = parameter_symbols(model)
-    builder = ProgramBuilder([*point, *parameters])
-    result = {"project": builder.program(list(project(model, point)))}
+    point, ab = sp.symbols("X Y Z", real=True), sp.symbols("a b", real=True)
+    of_point = [*point, *parameter_symbols(model)]
+    of_image = [*ab, *parameter_symbols(model)]
+    uv = list(project(model, point))
+    result = {"project": ProgramBuilder(of_point).program(uv)}
     if model in CLOSED:
-        uv = list(project(model, point))
         first = [sp.diff(e, s) for e in uv for s in point]
-    else:
-        uv, first = _chained(model, builder, point)
-    result["jacobian"] = builder.program([*uv, *first])
-    ab = sp.symbols("a b", real=True)
-    builder = ProgramBuilder([*ab, *parameters])
-    if model in CLOSED:
-        result["direction"] = builder.program(list(direction(model, *ab)))
-    else:
-        bent, slope = _bent_with_slopes(model, builder, *ab)
-        result["bend"] = builder.program([*bent, *slope])
+        result["jacobian"] = ProgramBuilder(of_point).program([*uv, *first])
+        result["direction"] = ProgramBuilder(of_image).program(list(direction(model, *ab)))
+        return result
+    full = _coefficients(model)
+    lenses = {"": full}
+    if model == "pinhole":
+        lenses[f"_{SHORT}"] = {n: k if i < SHORT else sp.S.Zero for i, (n, k) in enumerate(full.items())}
+    for ending, lens in lenses.items():
+        builder = ProgramBuilder(of_point)
+        result[f"jacobian{ending}"] = builder.program(_chained(model, builder, point, lens))
+        builder = ProgramBuilder(of_image)
+        bent, slope = _bent_with_slopes(builder, ab, partial(bend, model, lens=lens))
+        result[f"bend{ending}"] = builder.program([*bent, *slope])
     return result
 
 
 def _bent_with_slopes(
-    model: str, builder: ProgramBuilder, a: sp.Expr, b: sp.Expr, square: sp.Expr | None = None
+    builder: ProgramBuilder,
+    ab: tuple[sp.Expr, sp.Expr],
+    bent_of: Callable[..., tuple[sp.Expr, sp.Expr]],
+    square: sp.Expr | None = None,
 ) -> tuple[tuple[sp.Expr, sp.Expr], list[sp.Expr]]:
     """:func:`bend` and ∂a'/∂a, ∂a'/∂b, ∂b'/∂a, ∂b'/∂b, by the chain rule over a² + b²."""
     import sympy as sp
 
-    square = builder.let("square", a**2 + b**2 if square is None else square)
-    bent = bend(model, a, b, square)
+    square = builder.let("square", ab[0] ** 2 + ab[1] ** 2 if square is None else square)
+    bent = bent_of(*ab, square)
     outward = [builder.let(f"outward_{i}", sp.diff(e, square)) for i, e in enumerate(bent)]
-    slope = [sp.diff(e, s) + 2 * s * o for e, o in zip(bent, outward, strict=True) for s in (a, b)]
+    slope = [sp.diff(e, s) + 2 * s * o for e, o in zip(bent, outward, strict=True) for s in ab]
     return bent, slope
 
 
 def _chained(
-    model: str, builder: ProgramBuilder, point: tuple[sp.Symbol, ...]
-) -> tuple[list[sp.Expr], list[sp.Expr]]:
+    model: str, builder: ProgramBuilder, point: tuple[sp.Symbol, ...], lens: dict[str, sp.Expr]
+) -> list[sp.Expr]:
     """Pixel, and its derivatives for X, Y, Z, by the chain rule over (a, b) and (p, q)."""
     import sympy as sp
 
     fx, fy, cx, cy = parameter_symbols(model)[:4]
     inverse = builder.let("inverse", 1 / point[2])
     a, b = builder.let("a", point[0] * inverse), builder.let("b", point[1] * inverse)
+    bent_of = partial(bend, model, lens=lens)
     if model not in EQUIDISTANT:
-        bent, slope = _bent_with_slopes(model, builder, a, b)
+        bent, slope = _bent_with_slopes(builder, (a, b), bent_of)
         through = sp.Matrix(2, 2, slope)
     else:
         r2 = builder.let("r2", a**2 + b**2 + sp.Float(_TINY))
@@ -229,7 +247,7 @@ def _chained(
         ratio = builder.let("ratio", theta / sp.sqrt(r2))
         p, q = builder.let("p", a * ratio), builder.let("q", b * ratio)
         growth = builder.let("growth", (1 / (1 + r2) - ratio) / r2)  # ∂ratio/∂a = a growth
-        bent, slope = _bent_with_slopes(model, builder, p, q, theta**2)
+        bent, slope = _bent_with_slopes(builder, (p, q), bent_of, theta**2)
         cross = builder.let("cross", a * b * growth)
         chart = sp.Matrix([[ratio + a**2 * growth, cross], [cross, ratio + b**2 * growth]])
         through = sp.Matrix(2, 2, slope) * chart
@@ -238,4 +256,4 @@ def _chained(
         dx = builder.let(f"d{row}_x", focal * through[row, 0] * inverse)
         dy = builder.let(f"d{row}_y", focal * through[row, 1] * inverse)
         first += [dx, dy, -(a * dx + b * dy)]
-    return [fx * bent[0] + cx, fy * bent[1] + cy], first
+    return [fx * bent[0] + cx, fy * bent[1] + cy, *first]
