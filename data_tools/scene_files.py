@@ -139,14 +139,14 @@ class _Steps:
 
 def _write_tables(result: SceneResult, folder: Path, formats: tuple[str, ...], warnings: list[str]) -> None:
     tracks = result.tracks
-    decimals = length_decimals(tracks.position)
-    texts = {"tracks_3d": tracks_text(tracks, decimals)}
+    places = length_decimals(tracks.position)
+    texts = {"tracks_3d": tracks_text(tracks, places)}
     if tracks.smooth:
-        texts["points_3d"] = tracks_text(result.points, decimals)
+        texts["points_3d"] = tracks_text(result.points, places)
     texts["observations"] = observations_text(result)
-    texts["camera_paths"] = paths_text(result, decimals)
+    texts["camera_paths"] = paths_text(result, places)
     for name, text in texts.items():
-        (folder / f"{name}.csv").write_text(text, encoding="utf-8", newline="")
+        (folder / f"{name}.csv").write_bytes(text)
     if formats:
         _write_layouts(result, folder, formats, warnings)
 

@@ -16,6 +16,7 @@ from acino_fte.data_tools import scene_drawing
 from acino_fte.data_tools.camera_keys import KeyedCamera
 from acino_fte.data_tools.camera_paths import CameraPath
 from acino_fte.data_tools.colours import colours_of
+from acino_fte.data_tools.csv_columns import csv_bytes, decimals, labels
 from acino_fte.data_tools.point_cloud import PointCloud, read_ply
 from acino_fte.data_tools.scene_drawing import FigureProcess
 from acino_fte.data_tools.scene_drawing import scene_drawing as drawing_of
@@ -262,9 +263,34 @@ def test_small_scenes_keep_their_digits():
     result = scene_result(n_frames=70, scale=False)
     small = replace(result.tracks, position=1e-5 * result.tracks.position)
     text = tracks_text(small, length_decimals(small.position))
-    rows = [line.split(",") for line in text.splitlines()[1:]]
+    rows = [line.split(",") for line in text.decode().splitlines()[1:]]
     found = np.array([[float(cell) for cell in row[2:5]] for row in rows])
     np.testing.assert_allclose(found, small.position, atol=1e-6 * np.ptp(small.position))
+
+
+def one_column(cells):
+    return csv_bytes({"a": cells}).decode().split("\n")[1:-1]
+
+
+@pytest.mark.parametrize("places", [0, 1, 3, 6, 9])
+def test_numbers_are_what_formatting_makes_of_them(places):
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=4000) * 10.0 ** rng.integers(-8, 6, 4000)
+    values[:6] = 0.0, 1.0, -1.0, 9.9999999, 123456.0, -0.5 * 10.0**-places
+    found = one_column(decimals(values, places))
+    for text, value in zip(found, values, strict=True):
+        assert abs(float(text) - value) <= 0.5000001 * 10.0**-places + 1e-15 * abs(value)
+        assert len(text.partition(".")[2]) == places
+        assert text == f"{float(text):.{places}f}"
+
+
+def test_numbers_that_are_none_and_very_large_ones():
+    assert one_column(decimals(np.array([np.nan, np.inf, -np.inf, 2.0]), 2)) == ["", "", "", "2.00"]
+    assert one_column(decimals(np.array([1e15, -2.5, np.nan]), 3))[1:] == ["-2.500", ""]
+    assert float(one_column(decimals(np.array([1e15]), 3))[0]) == 1e15
+    assert one_column(decimals(np.array([True, False]), 0)) == ["1", "0"]
+    assert one_column(decimals(np.array([-12, 7, 0]), 0)) == ["-12", "7", "0"]
+    assert one_column(decimals(np.empty(0), 3)) == one_column(labels([], np.empty(0, dtype=int))) == []
 
 
 # --- layouts of other programs -----------------------------------------------------------------------
