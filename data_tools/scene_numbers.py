@@ -209,6 +209,7 @@ def summary(metrics: dict[str, Any]) -> list[str]:
     if metrics["noise_px"] is not None:
         lines.append(f"noise {metrics['noise_px']:.2f} px")
     lines += _world(metrics)
+    lines += _clocks(metrics["time_offsets"])
     lines += [
         f"distance {' – '.join(pair['individuals'])}: {pair['mean']:.4f} m ± {1000 * pair['sd']:.1f} mm "
         f"over {pair['count']} frames"
@@ -250,6 +251,21 @@ def _world(metrics: dict[str, Any]) -> list[str]:
     how = upright_by(metrics)
     lines.append(f"upright by {how}" if how else "axes as in the model, not upright")
     return lines
+
+
+def _clocks(offsets: dict[str, Any] | None) -> list[str]:
+    """A line about the clocks, when they were asked for."""
+    if not offsets:
+        return []
+    reference = offsets["reference"]
+    others = [
+        f"{name} {one['offset_frames']:+.2f} ± {one['offset_sd']:.2f}"
+        if one["offset_sd"] is not None
+        else f"{name} unknown"
+        for name, one in offsets["cameras"].items()
+        if name != reference
+    ]
+    return [f"clocks against {reference}, frames: {', '.join(others)}"]
 
 
 def _truth(truth: dict[str, Any] | None) -> list[str]:

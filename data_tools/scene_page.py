@@ -224,8 +224,26 @@ def _tables(metrics: dict[str, Any]) -> str:
         for name, c in metrics["cameras"].items()
     ]
     seconds = [(name, number(value, "s", 3)) for name, value in metrics["seconds"].items()]
-    tables = table(head, rows) + _distances(metrics) + table(("step", "time"), seconds)
+    tables = table(head, rows) + _distances(metrics) + _clocks(metrics) + table(("step", "time"), seconds)
     return f'<h2>Cameras, distances and time</h2><div class="tables">{tables}</div>'
+
+
+def _clocks(metrics: dict[str, Any]) -> str:
+    """Offsets of the clocks; nothing when they were not asked for."""
+    offsets = metrics["time_offsets"]
+    if not offsets:
+        return ""
+    head = ("camera", f"offset to {offsets['reference']}", "sd", "drift")
+    rows = [
+        (
+            name,
+            number(one["offset_frames"], "frames", 3),
+            number(one["offset_sd"], "frames", 3),
+            number(one["drift_ppm"], "ppm", 1),
+        )
+        for name, one in offsets["cameras"].items()
+    ]
+    return table(head, rows)
 
 
 def _distances(metrics: dict[str, Any]) -> str:

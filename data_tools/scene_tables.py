@@ -59,8 +59,9 @@ def observations_text(result: SceneResult) -> bytes:
     Returns
     -------
     bytes
-        CSV: camera, frame (on the camera's own clock), individual, x, y (px, pixel centres at integers),
-        reprojection_px (distance from the projected track; empty where there is none), used (1 or 0).
+        CSV: camera, frame, individual, x, y (px, pixel centres at integers), reprojection_px (distance from
+        the projected track; empty where there is none), used (1 or 0). On a common clock these are the dots
+        in whole frames of the reference camera.
     """
     tables = []
     for view, distance, used in zip(
