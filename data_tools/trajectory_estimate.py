@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize
 
-from acino_fte.data_tools.trajectory_motion import N_LAGS, MotionModel, Pieces, log_information
+from acino_fte.data_tools.trajectory_motion import N_LAGS, MotionModel, Pieces, innovations, log_information
 from acino_fte.data_tools.trajectory_smoother import ChainFactor
 
 _WINDOW, _SAMPLE = 50, 1500  # frames in a window, nodes to estimate the prior from
@@ -45,7 +45,8 @@ def estimate_motion(
         Where to begin; by default from the moments of the displacements.
     """
     noise = _noise(information)
-    scale = max(float(np.ptp(x, axis=0).max()), 100.0 * noise, 1e-6)
+    x = x - np.repeat(x[pieces.start], pieces.length, axis=0)  # a path's place means nothing
+    scale = max(2.0 * float(np.linalg.norm(x, axis=1).max()), 100.0 * noise, 1e-6)
     first = start or _from_moments(x, noise, information, pieces)
     centre = np.array([np.log(3.0 * noise + 1e-6 * scale), 0.0, 0.0])
 
@@ -68,11 +69,10 @@ def log_evidence(
 ) -> float:
     """log p(pixels) of a prior, up to a constant that no prior changes; arguments as above."""
     factor = ChainFactor(information, motion, pieces)
-    prior = factor.prior_times(x)
-    step = factor.solve(gradient - prior)
-    moved = x + step
+    step = factor.solve(gradient - factor.prior_times(x))
     cost = np.einsum("ni,nij,nj->", step, information, step) - 2 * np.vdot(gradient, step)
-    cost += np.vdot(moved, prior + factor.prior_times(step))
+    new = innovations(motion, pieces, x + step)  # xᵀP x itself would drown in rounding errors
+    cost += ((new**2).sum(1) / motion.variances[pieces.age]).sum()
     return -0.5 * (float(cost) + factor.log_determinant) + 1.5 * log_information(motion, pieces)
 
 
