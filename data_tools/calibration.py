@@ -250,16 +250,20 @@ def write_cameras(path: Path | str, cameras: CameraArray) -> None:
     Raises
     ------
     InputError
-        A camera is of a kind that the file has no words for: skew (DLT), or Vicon's lens.
+        A camera is of a kind that the file has no words for: skew (DLT), Vicon's lens, or a model that only
+        COLMAP knows.
     """
     for camera in cameras:
-        if type(camera) is not Camera:
+        if type(camera) is not Camera or camera.model not in ("pinhole", "fisheye"):
+            plain = type(camera) is Camera
             raise InputError(
                 f"Camera '{camera.name}' cannot be written as '{FORMAT}'.",
                 file=path,
                 expected="pinhole and fisheye cameras of OpenCV's kind",
-                found=f"a {type(camera).__name__}, which may have skew or another lens",
-                remedy="keep its own file (DLT coefficients, .xcp)",
+                found=f"the model '{camera.model}'"
+                if plain
+                else f"a {type(camera).__name__}, which may have skew or another lens",
+                remedy="keep its own file (COLMAP's model, DLT coefficients, .xcp)",
             )
     entries = [
         {

@@ -24,15 +24,21 @@ if TYPE_CHECKING:
 
 GAP_STEPS = 6.0
 """A gap in the key frames is too long from so many of their median steps on."""
+_LEAST_TURN, _LEAST_SHIFT = 1e-7, 1e-8  # rad; share of the path's extent. Nothing is surer
 _MISPLACED = 50.0  # squared distance of a key frame from what the others predict, in units of the usual
 
 
 @dataclass(frozen=True, eq=False)
 class PoseNoise:
-    """How far key frames are off: standard deviations of each turn (rad) and each coordinate of a centre."""
+    """How far key frames are off: standard deviations of each turn (rad) and each coordinate of a centre.
+
+    `shape` (6, 6) tells how turns and shifts, both in the camera's frame, hang together: their covariance in
+    units of these standard deviations. A camera that errs along a wall also turns, and sees it where it is.
+    """
 
     turn: np.ndarray | float
     shift: np.ndarray | float
+    shape: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +119,11 @@ def camera_path(
     CameraPath
         The path. Key frames far from where the others predict them are left out.
     """
-    turn = np.broadcast_to(np.asarray(noise.turn, dtype=float) ** 2, (len(camera.frame),))
-    shift = np.broadcast_to(np.asarray(noise.shift, dtype=float) ** 2, (len(camera.frame),))
+    turn = np.broadcast_to(np.maximum(noise.turn, _LEAST_TURN) ** 2, (len(camera.frame),))
+    least = _LEAST_SHIFT * float(np.linalg.norm(np.ptp(camera.centre, axis=0)))
+    shift = np.broadcast_to(np.maximum(noise.shift, max(least, 1e-15)) ** 2, (len(camera.frame),))
     if len(camera.frame) == 1:
-        return _standing(camera, float(turn[0]), float(shift[0]), frames)
+        return _standing(camera, float(turn[0]), float(shift[0]), noise.shape, frames)
     if max_gap is None:
         max_gap = GAP_STEPS * float(np.median(np.diff(camera.frame)))
     keep = np.ones(len(camera.frame), dtype=bool)
@@ -138,12 +145,34 @@ def camera_path(
     nearest = _nearest_known(known)
     centre, angles = centre[nearest], angles[nearest]
     matrix = _turned(rotation, time, unrolled, frame[nearest], angles).as_matrix()
-    covariance = np.zeros((len(frame), 6, 6))
-    axis = np.arange(3)
-    covariance[:, axis, axis] = turn_variance[nearest, None]
-    covariance[:, axis + 3, axis + 3] = centre_variance[nearest, None]
+    covariance = _covariance(
+        turn_variance[nearest], centre_variance[nearest], np.isin(frame, time), noise.shape
+    )
+    covariance = _shift_in_world(covariance, matrix)
     translation = -np.einsum("nij,nj->ni", matrix, centre)
     return CameraPath(camera.name, frame, matrix, translation, covariance, known, np.isin(frame, time))
+
+
+def _covariance(turn: np.ndarray, shift: np.ndarray, key: np.ndarray, shape: np.ndarray | None) -> np.ndarray:
+    """Covariances (N, 6, 6) in the camera's frame from the variances (N,) of turns and shifts.
+
+    As much as key frames have of each hangs together as the errors of the key frames do; what is added
+    between them, where the path is a guess, does not.
+    """
+    out = np.zeros((len(turn), 6, 6))
+    axis = np.arange(3)
+    parts = [np.minimum(each, np.median(each[key])) for each in (turn, shift)]
+    out[:, axis, axis] = (turn - parts[0])[:, None]
+    out[:, axis + 3, axis + 3] = (shift - parts[1])[:, None]
+    sd = np.sqrt(np.repeat(np.stack(parts, axis=1), 3, axis=1))
+    return out + sd[:, :, None] * (np.eye(6) if shape is None else shape) * sd[:, None, :]
+
+
+def _shift_in_world(covariance: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Covariances (N, 6, 6) with the shift turned from the camera's frame to the world's."""
+    change = np.zeros((len(rotation), 6, 6))
+    change[:, :3, :3], change[:, 3:, 3:] = np.eye(3), rotation.transpose(0, 2, 1)
+    return change @ covariance @ change.transpose(0, 2, 1)
 
 
 def unroll(rotation: Rotation) -> np.ndarray:
@@ -181,11 +210,19 @@ def _nearest_known(known: np.ndarray) -> np.ndarray:
     return np.where(np.abs(every - before) <= np.abs(after - every), before, after)
 
 
-def _standing(camera: KeyedCamera, turn: float, shift: float, frames: tuple[int, int] | None) -> CameraPath:
+def _standing(
+    camera: KeyedCamera,
+    turn: float,
+    shift: float,
+    shape: np.ndarray | None,
+    frames: tuple[int, int] | None,
+) -> CameraPath:
     first, stop = frames or (int(camera.frame[0]), int(camera.frame[0]) + 1)
     frame = np.arange(min(first, camera.frame[0]), max(stop, camera.frame[0] + 1))
     n = len(frame)
-    covariance = np.broadcast_to(np.diag([turn] * 3 + [shift] * 3), (n, 6, 6)).copy()
+    one = np.ones(1, dtype=bool)
+    covariance = _covariance(np.array([turn]), np.array([shift]), one, shape)
+    covariance = np.broadcast_to(_shift_in_world(covariance, camera.rotation), (n, 6, 6)).copy()
     return CameraPath(
         camera.name,
         frame,

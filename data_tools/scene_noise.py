@@ -5,16 +5,16 @@ point by a random vector with covariance M_g. The point's information is then
 
     Λ = Σ_g (I + κ A_g M_g)⁻¹ A_g
 
-(Woodbury's identity on σ²I + κ J_g M_g J_gᵀ); for one rig alone Λ⁻¹ = A⁻¹ + M. The share κ of the errors is
-each base's own. The rest, 1 − κ, is common to all: cameras on one vehicle that are not treated as a rig bob
-together between their key frames, which no residual shows, and Λ⁻¹ grows by (1 − κ) M̄.
+(Woodbury's identity on σ²I + κ J_g M_g J_gᵀ); for one rig alone Λ⁻¹ = A⁻¹ + M. κ says how much the poses err
+against what is said of them. Cameras of one body that are not treated as a rig bob together between their key
+frames, which no residual shows: where κ < 1 for such cameras, Λ⁻¹ grows by (1 − κ) M̄.
 
 σ and κ come from the residuals. At the least-squares point the expected sum of squares is
 
     σ² ν + κ tr(P_⊥ Σ_g J_g M_g J_gᵀ),   P_⊥ = I − J (JᵀJ)⁻¹ Jᵀ,
 
 with ν degrees of freedom; the points differ in both terms, as poses are surer in key frames than between.
-Shapes: P dots, T points, B bases.
+Where they hardly differ, a broad law of log κ around 0 decides. Shapes: P dots, T points, B bases.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from acino_fte.data_tools.scene_rows import SceneRows, Views, pose_shift
 NOISE_FLOOR = 0.02
 """Standard deviation of a dot, px; no detector is better."""
 _BINS, _FEWEST = 10, 20  # groups of points with like errors from poses, and points in one
-_CONTRAST = 1.5  # of the groups' errors from poses, without which the two noises cannot be told apart
-_MOST = 25.0  # κ; poses off by more than five times what is said of them are no poses
+_OWN = np.geomspace(0.01, 25.0, 241)  # κ; poses off by more than five times what is said are no poses
+_BROAD, _MODEL = 0.7, 0.05  # standard deviation of log κ before any data; relative error of a group's level
 
 
 @dataclass(frozen=True)
@@ -41,16 +41,14 @@ class SceneNoise:
     px : float
         Standard deviation of a dot's coordinate.
     own : float
-        κ, share of the poses' variance that is each base's own; above 1 where the poses are worse than said.
+        κ, variance of the poses over what is said of it.
+    common : float
+        Share of the stated variance that all bases have in common.
     """
 
     px: float
     own: float = 1.0
-
-    @property
-    def common(self) -> float:
-        """Share of the poses' variance that all bases have in common."""
-        return max(1.0 - self.own, 0.0)
+    common: float = 0.0
 
 
 class PointInformation:
@@ -70,6 +68,7 @@ class PointInformation:
 
     def __init__(self, rows: SceneRows, views: Views, position: np.ndarray, used: np.ndarray) -> None:
         self._there = np.flatnonzero(np.isfinite(position[:, 0]))
+        self._attached = views.attached
         self._position, n = position, rows.n_points
         place = np.full(n, -1)
         place[self._there] = np.arange(len(self._there))
@@ -94,16 +93,11 @@ class PointInformation:
         ratio = self._squared[free] / (self._freedom[free] * median_of_chi2(self._freedom[free]))
         if len(self._moves) == 1:
             return SceneNoise(px or max(float(np.sqrt(np.median(ratio))), NOISE_FLOOR))
-        from_poses = self._from_poses()[free] / self._freedom[free]
-        typical, level = _in_groups(from_poses, ratio)
-        if px is None and (len(level) < 3 or level.max() < _CONTRAST * level.min()):
-            variance = float(np.median(typical - level))
-            return SceneNoise(np.sqrt(max(variance, NOISE_FLOOR**2)))
-        if px is None:
-            variance, own = _line(level, typical)
-            return SceneNoise(float(np.sqrt(variance)), own)
-        own = float(np.median((typical - px**2) / np.maximum(level, 1e-12)))
-        return SceneNoise(px, float(np.clip(own, 0.0, _MOST)))
+        level, typical, count = _in_groups(self._from_poses()[free] / self._freedom[free], ratio)
+        relative = np.hypot(_MODEL, 1.5 * np.sqrt(2.0 / (float(np.median(self._freedom[free])) * count)))
+        variance, own = _best_line(level, typical, relative, px)
+        common = max(1.0 - own, 0.0) if self._attached else 0.0
+        return SceneNoise(float(np.sqrt(variance)), own, common)
 
     def _from_poses(self) -> np.ndarray:
         """tr(P_⊥ Σ_g J_g M_g J_gᵀ) of points, px²."""
@@ -173,22 +167,24 @@ def median_of_chi2(freedom: np.ndarray) -> np.ndarray:
     return (1.0 - 2.0 / (9.0 * freedom)) ** 3
 
 
-def _in_groups(from_poses: np.ndarray, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Median of the ratios and of the errors from poses in groups of points with like errors from poses."""
+def _in_groups(from_poses: np.ndarray, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Groups of points with like errors from poses: medians of these and of the ratios, and their numbers."""
     n = max(1, min(_BINS, len(ratio) // _FEWEST))
     groups = np.array_split(np.argsort(from_poses, kind="stable"), n)
+    level = np.array([np.median(from_poses[group]) for group in groups])
     typical = np.array([np.median(ratio[group]) for group in groups])
-    return typical, np.array([np.median(from_poses[group]) for group in groups])
+    return level, typical, np.array([len(group) for group in groups])
 
 
-def _line(level: np.ndarray, typical: np.ndarray) -> tuple[float, float]:
-    """σ² and κ of typical = σ² + κ level, both in their ranges; each group weighs by its own variance."""
-    weight = 1.0 / typical
-    columns = np.stack([np.ones_like(level), level], axis=1) * weight[:, None]
-    (variance, own), *_ = np.linalg.lstsq(columns, typical * weight, rcond=None)
-    if own < 0.0:
-        variance, own = float(np.average(typical, weights=weight**2)), 0.0
-    if variance < NOISE_FLOOR**2:
-        variance = NOISE_FLOOR**2
-        own = float(((typical - variance) * level * weight**2).sum() / ((level * weight) ** 2).sum())
-    return float(variance), float(np.clip(own, 0.0, _MOST))
+def _best_line(
+    level: np.ndarray, typical: np.ndarray, relative: np.ndarray, px: float | None
+) -> tuple[float, float]:
+    """σ² and κ of typical = σ² + κ level, with relative errors of the typical values (G,)."""
+    weight = 1.0 / (relative * np.maximum(typical, NOISE_FLOOR**2))
+    rest = typical - _OWN[:, None] * level  # what is left for σ², (κ, G)
+    variance = np.maximum((rest * weight**2).sum(1) / (weight**2).sum(), NOISE_FLOOR**2)
+    if px is not None:
+        variance = np.full(len(_OWN), px**2)
+    cost = (((rest - variance[:, None]) * weight) ** 2).sum(1) + (np.log(_OWN) / _BROAD) ** 2
+    best = int(np.argmin(cost))
+    return float(variance[best]), float(_OWN[best])

@@ -97,7 +97,9 @@ def scene_paths(
             notes.append(f"Camera '{camera.name}' has one image with a pose: it is taken to stand still.")
     ordered = tuple(paths[camera.name] for camera in cameras)
     lenses = [camera.lens for camera in cameras]
-    views = make_views(lenses, ordered, bases, [base[camera.name] for camera in cameras])
+    alone = [camera for camera in cameras if all(camera.name not in one.names for one in rigs)]
+    attached = len(bases) > 1 and bool(find_rigs(alone))
+    views = make_views(lenses, ordered, bases, [base[camera.name] for camera in cameras], attached)
     return ScenePaths(ordered, tuple(rigs), views, noise, tuple(notes))
 
 
@@ -108,10 +110,16 @@ def pose_noise(camera: KeyedCamera) -> PoseNoise:
     itself noisy. Without covariances a pixel's angle, and a hundredth of the way between key frames.
     """
     if camera.covariance is not None:
-        traces = np.einsum("kii->ki", camera.covariance)
-        turn, shift = np.sqrt(traces[:, :3].mean(1)), np.sqrt(traces[:, 3:].mean(1))
-        if np.isfinite(turn).any():
-            return PoseNoise(float(np.nanmedian(turn)), float(np.nanmedian(shift)))
+        known = np.isfinite(camera.covariance).all((1, 2))
+        covariance = camera.covariance[known]
+        variances = np.einsum("kii->ki", covariance)
+        turn, shift = np.sqrt(variances[:, :3].mean(1)), np.sqrt(variances[:, 3:].mean(1))
+        if known.any() and (turn > 0).all() and (shift > 0).all():
+            to_camera = np.tile(np.eye(6), (len(covariance), 1, 1))
+            to_camera[:, 3:, 3:] = camera.rotation[known]
+            unit = np.repeat(np.stack([turn, shift], axis=1), 3, axis=1)
+            shape = to_camera @ covariance @ to_camera.transpose(0, 2, 1) / (unit[:, :, None] * unit[:, None])
+            return PoseNoise(float(np.median(turn)), float(np.median(shift)), shape.mean(0))
     steps = np.linalg.norm(np.diff(camera.centre, axis=0), axis=1)
     way = float(np.median(steps)) if len(steps) else float(np.linalg.norm(camera.translation[0]))
     return PoseNoise(_TURN_PX / camera.lens.matrix[0, 0], max(way / _DISTANCE, 1e-12))

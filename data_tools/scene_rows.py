@@ -37,6 +37,8 @@ class Views:
     base : (C,) int
         Index of each camera's base.
     first_frame : int
+    attached : bool
+        Whether bases that err apart are cameras of one body.
     """
 
     cameras: CameraArray
@@ -44,10 +46,15 @@ class Views:
     bases: tuple[CameraPath, ...]
     base: np.ndarray
     first_frame: int
+    attached: bool = False
 
 
 def make_views(
-    lenses: Sequence[Camera], paths: Sequence[CameraPath], bases: Sequence[CameraPath], base: Sequence[int]
+    lenses: Sequence[Camera],
+    paths: Sequence[CameraPath],
+    bases: Sequence[CameraPath],
+    base: Sequence[int],
+    attached: bool = False,
 ) -> Views:
     """Cameras with their paths, made as long as the longest."""
     first = min(int(path.frame[0]) for path in paths)
@@ -60,7 +67,7 @@ def make_views(
         cameras.append(
             replace(lens, name=path.name, rotation=path.rotation[row], translation=path.translation[row])
         )
-    return Views(CameraArray(tuple(cameras)), known, tuple(bases), np.asarray(base), first)
+    return Views(CameraArray(tuple(cameras)), known, tuple(bases), np.asarray(base), first, attached)
 
 
 @dataclass(frozen=True, eq=False)

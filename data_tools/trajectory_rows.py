@@ -158,7 +158,7 @@ class Measurements:
         residual, slope = np.empty((len(self.node), 2)), np.empty((len(self.node), 2, 3))
         for at, camera in self._parts:
             pixels, slope[at] = project_rows(camera, x[self.node[at]])
-            residual[at] = self.xy[at] - pixels
+            residual[at] = camera.pixel_difference(self.xy[at], pixels)
         return residual, slope
 
     def information(

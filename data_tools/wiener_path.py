@@ -20,7 +20,7 @@ from math import factorial
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-_SEARCH = (-12.0, 28.0)  # log of q over the noise's variance
+_SEARCH = (-12.0, 45.0)  # log of q over the noise's variance
 
 
 @dataclass(frozen=True, eq=False)
