@@ -1,10 +1,11 @@
 """Where a moving camera is in every frame, from its key frames: splines with their uncertainty.
 
 Centres and rotations of the key frames are noisy points on smooth curves. Centres follow
-:mod:`wiener_path` with p = 3. Rotations are unrolled into a curve of three angles, ρ_(k+1) = ρ_k +
-log(R_(k+1) R_kᵀ), which is smoothed like a centre; the difference to the interpolating spline of the same
-angles, which is small, turns SciPy's rotation spline through the key frames. Nothing is made up before
-the first key frame, after the last one, or across long gaps. Shapes: K key frames, N frames.
+:mod:`wiener_path` with p = 3, or with p = 2 where key frames are too far apart for the motion. Rotations are
+unrolled into a curve of three angles, ρ_(k+1) = ρ_k + log(R_(k+1) R_kᵀ), which is smoothed like a centre; the
+difference to the interpolating spline of the same angles, which is small, turns SciPy's rotation spline
+through the key frames. Nothing is made up before the first key frame, after the last one, or across long
+gaps. Shapes: K key frames, N frames.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 GAP_STEPS = 6.0
 """A gap in the key frames is too long from so many of their median steps on."""
 _LEAST_TURN, _LEAST_SHIFT = 1e-7, 1e-8  # rad; share of the path's extent. Nothing is surer
+_FORESEEN, _MEDIAN = (
+    2.5,
+    0.79,
+)  # of χ²/3: how far off key frames may be from what the others predict; its median
 _MISPLACED = 50.0  # squared distance of a key frame from what the others predict, in units of the usual
 
 
@@ -131,8 +136,8 @@ def camera_path(
         keys = np.flatnonzero(keep)
         time, rotation = camera.frame[keys], Rotation.from_matrix(camera.rotation[keys])
         unrolled = unroll(rotation)
-        centres = fit_wiener_path(time, camera.centre[keys], shift[keys], max_gap=max_gap)
-        turns = fit_wiener_path(time, unrolled, turn[keys], max_gap=max_gap)
+        centres = _curve(time, camera.centre[keys], shift[keys], max_gap)
+        turns = _curve(time, unrolled, turn[keys], max_gap)
         misplaced = _misplaced(centres, camera.centre[keys], shift[keys])
         misplaced |= _misplaced(turns, unrolled, turn[keys])
         if not misplaced.any() or (~misplaced).sum() < 4:
@@ -151,6 +156,15 @@ def camera_path(
     covariance = _shift_in_world(covariance, matrix)
     translation = -np.einsum("nij,nj->ni", matrix, centre)
     return CameraPath(camera.name, frame, matrix, translation, covariance, known, np.isin(frame, time))
+
+
+def _curve(time: np.ndarray, points: np.ndarray, noise: np.ndarray, max_gap: float) -> WienerPath:
+    """The smooth curve; a rougher one where that does not foresee key frames, too far apart as they are."""
+    for order in (3, 2):
+        path = fit_wiener_path(time, points, noise, order=order, max_gap=max_gap)
+        if np.median(path.deleted_distance(points, noise)) < _FORESEEN * _MEDIAN:
+            break
+    return path
 
 
 def _covariance(turn: np.ndarray, shift: np.ndarray, key: np.ndarray, shape: np.ndarray | None) -> np.ndarray:

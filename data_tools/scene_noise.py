@@ -14,7 +14,8 @@ frames, which no residual shows: where κ < 1 for such cameras, Λ⁻¹ grows by
     σ² ν + κ tr(P_⊥ Σ_g J_g M_g J_gᵀ),   P_⊥ = I − J (JᵀJ)⁻¹ Jᵀ,
 
 with ν degrees of freedom; the points differ in both terms, as poses are surer in key frames than between.
-Where they hardly differ, a broad law of log κ around 0 decides. Shapes: P dots, T points, B bases.
+Where they hardly differ, broad laws decide: log κ is about 0, and σ about what the tracks' third differences
+have (20 σ² for white noise). Shapes: P dots, T points, B bases.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ NOISE_FLOOR = 0.02
 """Standard deviation of a dot, px; no detector is better."""
 _BINS, _FEWEST = 10, 20  # groups of points with like errors from poses, and points in one
 _OWN = np.geomspace(0.01, 25.0, 241)  # κ; poses off by more than five times what is said are no poses
-_BROAD, _MODEL = 0.7, 0.05  # standard deviation of log κ before any data; relative error of a group's level
+_BROAD_OWN, _BROAD_PX = 0.5, 0.35  # standard deviations of log κ and log σ before any residual
+_MODEL = 0.1  # relative error of a group's level
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ class PointInformation:
     def __init__(self, rows: SceneRows, views: Views, position: np.ndarray, used: np.ndarray) -> None:
         self._there = np.flatnonzero(np.isfinite(position[:, 0]))
         self._attached = views.attached
+        self._roughness = roughness(rows)
         self._position, n = position, rows.n_points
         place = np.full(n, -1)
         place[self._there] = np.arange(len(self._there))
@@ -95,7 +98,7 @@ class PointInformation:
             return SceneNoise(px or max(float(np.sqrt(np.median(ratio))), NOISE_FLOOR))
         level, typical, count = _in_groups(self._from_poses()[free] / self._freedom[free], ratio)
         relative = np.hypot(_MODEL, 1.5 * np.sqrt(2.0 / (float(np.median(self._freedom[free])) * count)))
-        variance, own = _best_line(level, typical, relative, px)
+        variance, own = _best_line(level, typical, relative, px, self._roughness)
         common = max(1.0 - own, 0.0) if self._attached else 0.0
         return SceneNoise(float(np.sqrt(variance)), own, common)
 
@@ -177,7 +180,7 @@ def _in_groups(from_poses: np.ndarray, ratio: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _best_line(
-    level: np.ndarray, typical: np.ndarray, relative: np.ndarray, px: float | None
+    level: np.ndarray, typical: np.ndarray, relative: np.ndarray, px: float | None, usual_px: float
 ) -> tuple[float, float]:
     """σ² and κ of typical = σ² + κ level, with relative errors of the typical values (G,)."""
     weight = 1.0 / (relative * np.maximum(typical, NOISE_FLOOR**2))
@@ -185,6 +188,21 @@ def _best_line(
     variance = np.maximum((rest * weight**2).sum(1) / (weight**2).sum(), NOISE_FLOOR**2)
     if px is not None:
         variance = np.full(len(_OWN), px**2)
-    cost = (((rest - variance[:, None]) * weight) ** 2).sum(1) + (np.log(_OWN) / _BROAD) ** 2
+    cost = (((rest - variance[:, None]) * weight) ** 2).sum(1) + (np.log(_OWN) / _BROAD_OWN) ** 2
+    if np.isfinite(usual_px) and px is None:
+        cost += (0.5 * np.log(variance / max(usual_px, NOISE_FLOOR) ** 2) / _BROAD_PX) ** 2
     best = int(np.argmin(cost))
     return float(variance[best]), float(_OWN[best])
+
+
+def roughness(rows: SceneRows) -> float:
+    """Standard deviation of a dot's coordinate from the tracks' third differences, px; NaN without any."""
+    frame, individual = rows.frame[rows.point], rows.individual[rows.point]
+    order = np.lexsort((frame, individual, rows.camera))
+    frame, xy = frame[order], rows.measured.xy[order]
+    track = (individual * (rows.camera.max(initial=0) + 1) + rows.camera)[order]
+    whole = (track[3:] == track[:-3]) & (frame[3:] - frame[:-3] == 3)
+    if not whole.any():
+        return float("nan")
+    third = np.diff(xy, n=3, axis=0)[whole]
+    return 1.4826 * float(np.median(np.abs(third))) / np.sqrt(20.0)
