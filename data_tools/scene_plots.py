@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
-from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
@@ -34,6 +33,7 @@ _WILD, _KEPT = (
     0.001,
     1.0,
 )  # share of points that may be far off; how far, of the others' extent, they are shown
+_WIDTHS = {"-": 0.9, "--": 0.7, ":": 0.6}
 _MOST_STEPS = 2500  # columns of a picture over time
 _STATES: tuple[tuple[str, str], ...] = (
     ("interpolated", "#CFCFCF"),
@@ -68,7 +68,9 @@ def save_scene_figures(drawing: SceneDrawing, folder: Path) -> list[Path]:
         for name, draw in FIGURES.items():
             figure = draw(drawing)
             written += [folder / f"{name}.png", folder / f"{name}.pdf"]
-            figure.savefig(written[-2], dpi=DPI, metadata={"Software": None})
+            figure.savefig(
+                written[-2], dpi=DPI, metadata={"Software": None}, pil_kwargs={"compress_level": 1}
+            )
             figure.savefig(written[-1], metadata={"CreationDate": None, "Producer": None})
     return written
 
@@ -170,24 +172,34 @@ def _panel(
 ) -> None:
     pick, unit = list(shown), drawing.unit
     if len(drawing.cloud):
-        axes.plot(*drawing.cloud[:, pick].T, ".", color="#B9B9B9", ms=1.2, mew=0, zorder=0)
+        _dots(axes, drawing.cloud[:, pick], "#B9B9B9")
     new = np.r_[True, (np.diff(drawing.pose_camera) != 0) | (np.diff(drawing.pose_frame) != 1)]
-    paths = [
-        drawing.pose_centre[a:b, pick] for a, b in zip(*runs(new[: len(drawing.pose_camera)]), strict=True)
-    ]
-    axes.add_collection(LineCollection(paths, colors="#9A9A9A", lw=0.4, zorder=1))
+    spans = zip(*runs(new[: len(drawing.pose_camera)]), strict=True)
+    paths = [drawing.pose_centre[a:b, pick] for a, b in spans]
+    axes.plot(*_broken(paths).T, color="#9A9A9A", lw=0.4, zorder=1)
     colours = colours_of(len(drawing.individuals))
-    for style, width in ((":", 0.6), ("--", 0.7), ("-", 0.9)):
-        some = [(line[:, pick], colours[who]) for line, who, kind in lines if kind == style]
-        if some:
-            parts, shades = zip(*some, strict=True)
-            axes.add_collection(
-                LineCollection(list(parts), colors=list(shades), lw=width, ls=style, zorder=2)
-            )
+    together: dict[tuple[str, int], list[np.ndarray]] = {}
+    for line, who, style in lines:
+        together.setdefault((style, who), []).append(line[:, pick])
+    for (style, who), parts in together.items():
+        axes.plot(*_broken(parts).T, style, color=colours[who], lw=_WIDTHS[style], zorder=2)
     _label(axes, f"{'xyz'[shown[0]]} ({unit})", f"{'xyz'[shown[1]]} ({unit})")
     axes.locator_params(axis="y", nbins=max(2, min(7, round(axes.get_window_extent().height / 60))))
     axes.grid(True, lw=0.3, color="#DDDDDD")
     axes.set_axisbelow(True)
+
+
+def _broken(parts: list[np.ndarray]) -> np.ndarray:
+    """Lines (n, 2) as one that is broken between them: much faster to draw than a collection."""
+    gap = np.full((1, 2), np.nan)
+    return np.concatenate([row for part in parts for row in (part, gap)] or [gap])
+
+
+def _dots(axes: Axes, points: np.ndarray, colour: str) -> None:
+    """Points (n, 2) as very short lines with round ends, for the same reason."""
+    end = points + 1e-4 * np.ptp(points, axis=0).max()
+    line = np.stack([points, end, np.full_like(points, np.nan)], axis=1).reshape(-1, 2)
+    axes.plot(*line.T, color=colour, lw=1.2, solid_capstyle="round", zorder=0)
 
 
 def quality_figure(drawing: SceneDrawing) -> Figure:
