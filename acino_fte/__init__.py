@@ -19,6 +19,11 @@ The trajectory problem alone, without estimating noise or parameters:
 Animals without markers, as 2D tracks of several cameras:
 
 >>> matches = af.match_tracks(af.load_tracks("examples/bird_tracks"))  # doctest: +SKIP
+
+Animals that moving cameras saw, from a COLMAP model and their 2D tracks:
+
+>>> scene = af.Scene.from_colmap("examples/wand_rig").placed(["cam0-cam1=0.6"])  # doctest: +SKIP
+>>> tracks = scene.triangulate().tracks                          # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -57,6 +62,9 @@ _PUBLIC = {
     "smooth_trajectories": "data_tools.trajectories3d",
     "TrackSimulation": "data_tools.simulate_tracks",
     "simulate_tracks": "data_tools.simulate_tracks",
+    "Scene": "data_tools.scene",
+    "SceneSimulation": "data_tools.simulate_scene",
+    "simulate_scene": "data_tools.simulate_scene",
 }
 
 __all__ = ["__version__", *_PUBLIC]

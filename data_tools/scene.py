@@ -12,17 +12,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from acino_fte.data_tools.camera_keys import KeyedCamera
-from acino_fte.data_tools.colmap import read_colmap
-from acino_fte.data_tools.colmap_covariance import pose_covariances
+from acino_fte.data_tools.colmap import ColmapModel, read_colmap
+from acino_fte.data_tools.colmap_covariance import PoseErrors, mended, pose_errors
 from acino_fte.data_tools.colmap_images import keyed_cameras, parse_image_names
 from acino_fte.data_tools.point_cloud import PointCloud
 from acino_fte.data_tools.scene_paths import RigChoice, ScenePaths, scene_paths
 from acino_fte.data_tools.scene_points import retriangulate, triangulate_points
+from acino_fte.data_tools.scene_record import scene_record
 from acino_fte.data_tools.scene_result import (
     SceneResult,
     single_frames,
@@ -65,6 +66,8 @@ class Scene:
         Where up comes from; without it the axes are those of the model.
     clocks : TimeOffsets, optional
         How the cameras' clocks were brought together; without it frames with one number are of one time.
+    declared_rigs : tuple of tuple of str
+        Cameras that the model declares as rigs.
     fps : float, optional
         Frames per second.
     warnings : tuple of str
@@ -79,6 +82,7 @@ class Scene:
     scale: ScaleEstimate | None = None
     axes: AxesEstimate | None = None
     clocks: TimeOffsets | None = None
+    declared_rigs: tuple[tuple[str, ...], ...] = ()
     fps: float | None = None
     warnings: tuple[str, ...] = ()
 
@@ -104,6 +108,7 @@ class Scene:
         node: str | None = None,
         cm_per_pixel: float | None = None,
         dense: Path | str | None = None,
+        adjust_poses: bool = False,
     ) -> Scene:
         """Read a scene from a folder with a COLMAP model and 2D tracks.
 
@@ -127,6 +132,9 @@ class Scene:
             TRex's setting.
         dense : Path, optional
             A PLY file with a dense cloud, in place of the model's points.
+        adjust_poses : bool
+            Poses that are not where the model's own observations have them (they may come from GPS, or from
+            resection alone) are moved there. Adjusted models stay as they are.
 
         Raises
         ------
@@ -143,7 +151,11 @@ class Scene:
             )
         read = read_colmap(folder if model is None else model)
         images = parse_image_names(read.names, pattern)
-        cameras = keyed_cameras(read, images, pose_covariances(read))
+        errors = pose_errors(read)
+        covariance = errors.covariance
+        if adjust_poses:
+            read, covariance = mended(read, errors), errors.after_step
+        cameras = keyed_cameras(read, images, covariance)
         place = Path(tracks) if Path(tracks).is_absolute() else folder / tracks
         place = place if place.exists() else Path(tracks)
         if not place.exists():
@@ -171,7 +183,8 @@ class Scene:
             tracks=files.tracks,
             cloud=cloud,
             fps=fps,
-            warnings=(*read.notes, *files.notes),
+            declared_rigs=_declared(read, images.camera),
+            warnings=(*read.notes, *_adjustment_notes(errors, adjust_poses), *files.notes),
         )
 
     @property
@@ -273,7 +286,9 @@ class Scene:
         """The paths of all cameras (:func:`scene_paths.scene_paths`)."""
         seen = [view.frame for view in self.tracks if len(view)]
         frames = (min(map(np.min, seen)), max(map(np.max, seen)) + 1) if seen else None
-        return scene_paths(self.cameras, rig=rig, max_gap=max_pose_gap, frames=frames)
+        return scene_paths(
+            self.cameras, rig=rig, declared=self.declared_rigs, max_gap=max_pose_gap, frames=frames
+        )
 
     def triangulate(
         self,
@@ -327,7 +342,7 @@ class Scene:
                 tracks = with_single_views(points, tracks)
         notes = (*paths.notes, *self._unseen(rows, tracks.individual))
         numbers = {
-            **self._numbers(paths),
+            **scene_record(self, paths),
             "pose_noise_share": {"own": fit.noise.own, "common": fit.noise.common},
             "warnings": notes,
         }
@@ -348,64 +363,23 @@ class Scene:
             notes.append(f"No two views see these individuals at one time: {listed}. They have no 3D track.")
         return notes
 
-    def _numbers(self, paths: ScenePaths) -> dict[str, Any]:
-        def noise(one: Any) -> dict[str, float]:
-            return {
-                "turn_sd_deg": float(np.degrees(np.max(one.turn))),
-                "shift_sd_m": float(np.max(one.shift)),
-            }
 
-        return {
-            "pose_noise": {name: noise(one) for name, one in paths.noise.items()},
-            "rigs": [
-                {
-                    "cameras": list(one.names),
-                    "key_frames": len(one.count),
-                    "whiteness": one.whiteness,
-                    "drift_deg": float(np.degrees(one.drift_turn)),
-                    "drift_m": one.drift_shift,
-                    **noise(one.noise),
-                }
-                for one in paths.rigs
-            ],
-            "scale": None if self.scale is None else _scale_numbers(self.scale),
-            "axes": None
-            if self.axes is None
-            else {"how": self.axes.how, "tilt_sd_deg": float(np.degrees(self.axes.tilt_sd))},
-            "time_offsets": None if self.clocks is None else _clock_numbers(self.clocks),
-        }
+def _declared(model: ColmapModel, names: Sequence[str]) -> tuple[tuple[str, ...], ...]:
+    """The cameras of each rig that the model declares, where each of its sensors is one camera here."""
+    by_id: dict[int, set[str]] = {}
+    for camera_id, name in zip(model.camera_ids.tolist(), names, strict=True):
+        by_id.setdefault(camera_id, set()).add(name)
+    rigs = [[by_id.get(sensor, set()) for sensor in rig.camera_ids] for rig in model.declared_rigs]
+    whole = [rig for rig in rigs if all(len(name) == 1 for name in rig)]
+    return tuple(tuple(name for sensor in rig for name in sensor) for rig in whole)
 
 
-def _clock_numbers(clocks: TimeOffsets) -> dict[str, Any]:
-    return {
-        "reference": clocks.reference,
-        "cameras": {
-            name: {
-                "offset_frames": float(clocks.offset[c]),
-                "offset_sd": float(clocks.offset_sd[c]),
-                "drift_ppm": 1e6 * float(clocks.drift[c]),
-                "drift_ppm_sd": 1e6 * float(clocks.drift_sd[c]),
-            }
-            for c, name in enumerate(clocks.names)
-        },
-    }
-
-
-def _scale_numbers(scale: ScaleEstimate) -> dict[str, Any]:
-    pairs = zip(scale.distances, scale.measured, scale.residual, scale.normalised, strict=True)
-    return {
-        "factor": scale.factor,
-        "sd": scale.sd,
-        "chi2": scale.chi2,
-        "distances": [
-            {
-                "between": [known.first, known.second],
-                "kind": known.kind,
-                "length_m": known.length,
-                "measured_m": scale.factor * found.length,
-                "residual_m": float(residual),
-                "normalised": float(normalised),
-            }
-            for known, found, residual, normalised in pairs
-        ],
-    }
+def _adjustment_notes(errors: PoseErrors, adjusted: bool) -> list[str]:
+    if errors.adjusted:
+        return []
+    if adjusted:
+        return ["The poses were moved to where the model's own observations have them."]
+    return [
+        "The poses are not where the model's own observations have them. Run a bundle adjustment, or let "
+        "them be moved there (--adjust-poses)."
+    ]

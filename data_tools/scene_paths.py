@@ -46,6 +46,7 @@ def scene_paths(
     cameras: Sequence[KeyedCamera],
     *,
     rig: RigChoice = "auto",
+    declared: Sequence[tuple[str, ...]] = (),
     max_gap: float | None = None,
     frames: tuple[int, int] | None = None,
 ) -> ScenePaths:
@@ -57,6 +58,8 @@ def scene_paths(
         Of the scene.
     rig : "auto", "none", or sequence of sequences of names
         Which cameras keep their places to each other.
+    declared : sequence of tuple of str
+        Rigs for "auto", besides those that are found.
     max_gap : float, optional
         Frames between key frames beyond which nothing is invented.
     frames : (first, last + 1), optional
@@ -69,7 +72,7 @@ def scene_paths(
     """
     by_name = {camera.name: camera for camera in cameras}
     rigs, notes = [], []
-    for names in _chosen(rig, cameras):
+    for names in _chosen(rig, cameras, declared):
         fused = fuse_rig([by_name[name] for name in names])
         rigs.append(fused)
         notes += _drift_notes(fused)
@@ -125,13 +128,16 @@ def pose_noise(camera: KeyedCamera) -> PoseNoise:
     return PoseNoise(_TURN_PX / camera.lens.matrix[0, 0], max(way / _DISTANCE, 1e-12))
 
 
-def _chosen(rig: RigChoice, cameras: Sequence[KeyedCamera]) -> list[tuple[str, ...]]:
+def _chosen(
+    rig: RigChoice, cameras: Sequence[KeyedCamera], declared: Sequence[tuple[str, ...]]
+) -> list[tuple[str, ...]]:
     """The names of each rig."""
     if isinstance(rig, str):
         if rig == "none":
             return []
         if rig == "auto":
-            return find_rigs(cameras)
+            known = {name for group in declared for name in group}
+            return [*declared, *find_rigs([camera for camera in cameras if camera.name not in known])]
         rig = [[name.strip() for name in group.split(",")] for group in rig.split(";")]
     names = [camera.name for camera in cameras]
     given = [tuple(group) for group in rig]
