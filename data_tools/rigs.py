@@ -48,7 +48,7 @@ class Rig:
     keys : KeyedCamera
         The rig's frame in its K key frames, as if it were a camera.
     count : (K,) int
-        Images behind each key frame.
+        Images behind each key frame; wrong ones do not count.
     noise : PoseNoise
         Of a single image.
     whiteness : float
@@ -167,6 +167,7 @@ class _Averaging:
     def __init__(self, rotation: np.ndarray, centre: np.ndarray, seen: np.ndarray, names: list[str]) -> None:
         self._rotation, self._centre, self._names = rotation, centre, names
         self._seen, self._used = seen, seen.copy()
+        self._sure = np.ones(len(seen), dtype=bool)
         self._sensor, self._offset = self._start()
 
     def _start(self) -> tuple[np.ndarray, np.ndarray]:
@@ -202,12 +203,10 @@ class _Averaging:
             self._place_rig()
             before = self._sensor, self._offset
             self._place_sensors()
-            turn, shift = self._deviations()
-            if number == 2:
-                self._drop(turn, shift)
+            left = number > 0 and self._drop()
             moved = np.abs(self._sensor - before[0]).max()
             stepped = np.abs(self._offset - before[1]).max() / max(np.abs(self._offset).max(), 1e-12)
-            if number > 2 and moved < 1e-12 and stepped < 1e-12:
+            if number > 2 and not left and moved < 1e-12 and stepped < 1e-12:
                 break
         self._place_rig()
 
@@ -219,10 +218,12 @@ class _Averaging:
         self._rig_centre = total / self._used.sum(1)[:, None]
 
     def _place_sensors(self) -> None:
+        used = self._used & self._sure[:, None]
+        used = np.where(used.any(0), used, self._used)
         each = self._rotation @ self._rig.transpose(0, 2, 1)[:, None]
-        self._sensor = mean_rotation(np.where(self._used[..., None, None], each, 0.0).sum(0))
+        self._sensor = mean_rotation(np.where(used[..., None, None], each, 0.0).sum(0))
         step = np.einsum("kij,kcj->kci", self._rig, self._centre - self._rig_centre[:, None])
-        offset = np.where(self._used[..., None], step, 0.0).sum(0) / self._used.sum(0)[:, None]
+        offset = np.where(used[..., None], step, 0.0).sum(0) / used.sum(0)[:, None]
         gauge, shift = self._sensor[0].T, offset.mean(0)
         self._sensor, self._offset = self._sensor @ gauge, (offset - shift) @ self._sensor[0].T
 
@@ -236,28 +237,45 @@ class _Averaging:
         shift = np.where(self._seen[..., None], self._centre - self._rig_centre[:, None] - lever, 0.0)
         return turn, shift
 
-    def _drop(self, turn: np.ndarray, shift: np.ndarray) -> None:
-        far = np.zeros_like(self._seen)
-        for deviation in (turn, shift):
+    def _far(self) -> np.ndarray:
+        """How far images are off (K, S), squared, against what is usual beside others; 1 is the limit."""
+        several = self._used & (self._used.sum(1) > 1)[:, None]
+        far = np.zeros(self._seen.shape)
+        for deviation in self._deviations():
             squared = (deviation**2).sum(2)
-            typical = np.median(squared[self._seen])
-            far |= self._seen & np.asarray(squared > _FAR**2 * max(float(typical), 1e-24))
-        left = self._seen & ~far
-        self._used = np.where(left.any(1)[:, None], left, self._seen)
+            typical = float(np.median(squared[several])) if several.any() else np.inf
+            far = np.maximum(far, squared / (_FAR**2 * max(typical, 1e-24)))
+        return far
+
+    def _drop(self) -> bool:
+        """Let the worst image of each key frame go if it is far off, and others come back; whether any did.
+
+        A wrong image takes the key frame with it, so that the right ones seem wrong: one goes at a time. Of
+        two that contradict each other none goes, but their key frame is not sure.
+        """
+        far, count = self._far(), self._used.sum(1)[:, None]
+        worst = far >= np.where(self._used, far, 0.0).max(1)[:, None]
+        used = np.where((far > 1.0) & worst & (count > 2), False, self._used) | (self._seen & (far <= 1.0))
+        sure = ~(used & (far > 1.0)).any(1)
+        changed = bool((used != self._used).any() or (sure != self._sure).any())
+        self._used, self._sure = used, sure
+        return changed
 
     def rig(self, frames: np.ndarray) -> Rig:
         """The result, with what the deviations tell."""
         turn, shift = self._deviations()
-        used, count = self._used, self._used.sum(1)
-        free = max(float(used.sum() - len(frames)), 1.0)  # of each coordinate
+        sure = self._sure if self._sure.any() else ~self._sure
+        self._used, count = self._used & sure[:, None], self._used.sum(1)[sure]
+        used = self._used
+        free = max(float(used.sum() - len(count)), 1.0)  # of each coordinate
         noise = PoseNoise(*(float(np.sqrt((d[used] ** 2).sum() / (3.0 * free))) for d in (turn, shift)))
         ratios = [
             _von_neumann(d[used[:, c], c]) for d in (turn, shift) for c in range(len(self._names))
             if used[:, c].sum() > _COMMON
         ]  # fmt: skip
-        place = Rotation.from_matrix(self._rig).as_matrix()
-        translation = -np.einsum("kij,kj->ki", place, self._rig_centre)
-        keys = KeyedCamera("rig", _NO_LENS, -1, frames, place, translation)
+        place = Rotation.from_matrix(self._rig[sure]).as_matrix()
+        translation = -np.einsum("kij,kj->ki", place, self._rig_centre[sure])
+        keys = KeyedCamera("rig", _NO_LENS, -1, frames[sure], place, translation)
         return Rig(
             tuple(self._names), self._sensor, self._offset, keys, count, noise,
             float(np.median(ratios)) if ratios else 2.0, self._drift(turn), self._drift(shift),
