@@ -127,6 +127,15 @@ def scene(
         bool,
         typer.Option("--time-offsets", help="Estimate offsets between the clocks.", rich_help_panel=_CAMERAS),
     ] = False,
+    adjust_poses: Annotated[
+        bool,
+        typer.Option(
+            "--adjust-poses",
+            help="Move poses that no bundle adjustment left (from GPS, or resection alone) to where the "
+            "model's own observations have them.",
+            rich_help_panel=_CAMERAS,
+        ),
+    ] = False,
     scale: Annotated[
         list[str] | None,
         typer.Option(
@@ -212,6 +221,7 @@ def scene(
             rig=_rig(rig),
             max_pose_gap=max_pose_gap,
             time_offsets=time_offsets,
+            adjust_poses=adjust_poses,
             scale=tuple(scale) if scale else None,
             gravity=gravity,
             smooth=smooth,
@@ -277,6 +287,7 @@ class SceneOptions:
     rig: Any
     max_pose_gap: str | None
     time_offsets: bool
+    adjust_poses: bool
     scale: tuple[str, ...] | None
     gravity: str | None
     smooth: bool
@@ -313,6 +324,7 @@ def _triangulated(folder: Path, given: SceneOptions, tell: Callable[[str], None]
         node=given.node,
         cm_per_pixel=given.cm_per_pixel,
         dense=given.dense,
+        adjust_poses=given.adjust_poses,
     )
     if given.time_offsets:
         tell("clocks")

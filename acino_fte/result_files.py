@@ -21,7 +21,6 @@ import yaml
 
 from acino_fte.errors import InputError
 from acino_fte.metrics import json_safe
-from acino_fte.result_dataset import to_dataset
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -208,6 +207,8 @@ def _swap(new: Path, folder: Path) -> None:
 
 def write_tables(result: FTEResult, folder: Path) -> None:
     """Write everything but figures and report into an existing folder."""
+    from acino_fte.result_dataset import to_dataset
+
     dataset = to_dataset(result)
     packed = {"zlib": True, "complevel": 1}
     encoding = {str(name): packed for name, v in dataset.data_vars.items() if v.dtype.kind == "f"}
