@@ -205,7 +205,8 @@ def serve() -> None:
     """What the process does: import, wait for a scene, draw it. Without one it leaves."""
     from acino_fte.data_tools.scene_plots import prepare, save_scene_figures
 
-    prepare()
+    families = prepare()
     head = sys.stdin.buffer.readline()
     if head:
-        save_scene_figures(SceneDrawing.from_bytes(sys.stdin.buffer.read()), Path(json.loads(head)))
+        drawing = SceneDrawing.from_bytes(sys.stdin.buffer.read())
+        save_scene_figures(drawing, Path(json.loads(head)), families)

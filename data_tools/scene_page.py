@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,7 @@ CAPTIONS = {
 """The figures of a scene: file name → what it shows."""
 _MOST, _MOST_CLOUD, _MOST_POSES = 80_000, 20_000, 2000  # points, points of the cloud, poses of a camera
 _STYLES = {SOURCES.index("single"): "--", SOURCES.index("interpolated"): ":"}
+_FRUSTUM = 0.25
 _STRAYS = 0.002  # share of points at each end that the first view need not show
 
 
@@ -102,7 +104,21 @@ def viewer_data(result: SceneResult) -> dict[str, Any]:
         "grid": ground_grid(np.clip(thinned(position, 5000), low, high)[:, None]),
         "middle": np.round(0.5 * (low + high), 6).tolist(),
         "size": max(float(np.linalg.norm(high - low)), 1e-6),
+        "frustum": _frustum(tracks, [path for _, path in pairs], float(np.linalg.norm(high - low))),
     }
+
+
+def _frustum(tracks: SceneTracks, paths: Sequence[CameraPath], size: float) -> float:
+    """How long cameras are drawn: a part of their distance from what they see, and of the scene's size."""
+    distances = []
+    for path in paths:
+        row = tracks.frame - path.frame[0]
+        rows = np.flatnonzero((row >= 0) & (row < len(path.frame)))
+        rows = rows[path.known[row[rows]]]
+        away = np.linalg.norm(tracks.position[rows] - path.centre[row[rows]], axis=1)
+        distances += [float(np.median(away))] if len(away) else []
+    part = _FRUSTUM * float(np.median(distances)) if distances else np.inf
+    return max(min(part, 0.06 * size), 1e-6)
 
 
 def track_pieces(tracks: SceneTracks, most: int = _MOST) -> list[dict[str, Any]]:

@@ -46,7 +46,7 @@ _STATES: tuple[tuple[str, str], ...] = (
 _SINGLE, _BETWEEN = SOURCES.index("single"), SOURCES.index("interpolated")
 
 
-def save_scene_figures(drawing: SceneDrawing, folder: Path) -> list[Path]:
+def save_scene_figures(drawing: SceneDrawing, folder: Path, families: list[str] | None = None) -> list[Path]:
     """Draw the figures of a scene into a folder, which is made if need be.
 
     Parameters
@@ -55,6 +55,8 @@ def save_scene_figures(drawing: SceneDrawing, folder: Path) -> list[Path]:
         What to draw.
     folder : Path
         For ``NAME.png`` (150 dots per inch) and ``NAME.pdf``, names as in :data:`FIGURES`.
+    families : list of str, optional
+        Fonts, the first one first.
 
     Returns
     -------
@@ -64,6 +66,8 @@ def save_scene_figures(drawing: SceneDrawing, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     style: Any = {**dict(matplotlib.rcParamsDefault), **STYLE, **_LATIN}  # whatever the user's settings are
+    if families:
+        style["font.family"] = families
     with matplotlib.rc_context(style):
         for name, draw in FIGURES.items():
             figure = draw(drawing)
@@ -75,14 +79,25 @@ def save_scene_figures(drawing: SceneDrawing, folder: Path) -> list[Path]:
     return written
 
 
-def prepare() -> None:
-    """Do what the first figure would wait for: canvases, fonts."""
+def prepare() -> list[str]:
+    """Do what the first figure would wait for: canvases, fonts.
+
+    Returns
+    -------
+    list of str
+        Fonts that :func:`save_scene_figures` embeds fast.
+    """
     import io
 
-    figure = Figure(figsize=(1, 1))
-    figure.text(0, 0, "m")
-    for kind in ("png", "pdf"):
-        figure.savefig(io.BytesIO(), format=kind)
+    from acino_fte.data_tools.light_font import add_light_font
+
+    families = add_light_font()
+    with matplotlib.rc_context({**dict(matplotlib.rcParamsDefault), **STYLE, "font.family": families}):
+        figure = Figure(figsize=(1, 1))
+        figure.text(0, 0, "m")
+        for kind in ("png", "pdf"):
+            figure.savefig(io.BytesIO(), format=kind)
+    return families
 
 
 def _begin(drawing: SceneDrawing, title: str, height: float) -> Figure:

@@ -12,6 +12,7 @@ cloud               xyz (q, 3) and rgb (q, 3) or null; null without a cloud
 first, last, fps    frames of the slider, included; fps may be null
 grid                x0, x1, y0, y1, step, z
 middle, size        of the scene
+frustum             length of the cameras' frusta; without it a share of the size
 ==================  ========================================================================================
 """
 
@@ -139,7 +140,7 @@ SCRIPT = """
     });
   }
   function cameras() {
-    const s = 0.06 * data.size;
+    const s = data.frustum || 0.06 * data.size;
     data.cameras.forEach((camera) => {
       const poses = camera.pose, n = camera.frames.length, still = n === 1;
       if (!still) {

@@ -20,6 +20,7 @@ from acino_fte.data_tools.scene_numbers import scene_metrics
 from acino_fte.data_tools.scene_page import CAPTIONS, track_pieces, viewer_data, write_scene_page
 from acino_fte.data_tools.scene_plots import (
     FIGURES,
+    prepare,
     quality_figure,
     save_scene_figures,
     space_figure,
@@ -194,6 +195,14 @@ def test_figures_are_files_whatever_the_user_s_style(drawing, tmp_path):
     assert set(FIGURES) == set(CAPTIONS)
     for path in files:
         assert path.read_bytes()[:4] == (b"%PDF" if path.suffix == ".pdf" else b"\x89PNG")
+
+
+@pytest.mark.parametrize(("name", "n_fonts"), [("Zoë", 1), ("Ωmega", 2)])
+def test_a_light_font_is_embedded_and_lends_letters_from_the_whole_one(tmp_path, name, n_fonts):
+    result = scene_result(n_frames=70, names=("Ann", name))
+    files = save_scene_figures(scene_drawing(result), tmp_path, prepare())
+    embedded = next(p for p in files if p.suffix == ".pdf").read_bytes()
+    assert embedded.count(b"/FontFile2") == n_fonts  # TrueType
 
 
 @pytest.mark.parametrize("n", [0, 1, 7, 21, 22, 60])
