@@ -92,7 +92,8 @@ def prepare() -> list[str]:
     from acino_fte.data_tools.light_font import add_light_font
 
     families = add_light_font()
-    with matplotlib.rc_context({**dict(matplotlib.rcParamsDefault), **STYLE, "font.family": families}):
+    style: Any = {**dict(matplotlib.rcParamsDefault), **STYLE, "font.family": families}
+    with matplotlib.rc_context(style):
         figure = Figure(figsize=(1, 1))
         figure.text(0, 0, "m")
         for kind in ("png", "pdf"):
