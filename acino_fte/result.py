@@ -134,6 +134,6 @@ class FTEResult:
 
     def to_dataset(self) -> xr.Dataset:
         """Everything as one labelled dataset, in the layout of the movement package."""
-        from acino_fte.result_files import to_dataset
+        from acino_fte.result_dataset import to_dataset
 
         return to_dataset(self)

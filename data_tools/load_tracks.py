@@ -31,8 +31,8 @@ from acino_fte.data_tools.tracker_exports import (
     read_idtracker,
     read_sleap,
     read_trex,
-    session_file,
 )
+from acino_fte.data_tools.tracker_folders import NO_TRACKS, TABLES, export_files
 from acino_fte.data_tools.tracks2d import TrackRecording, Tracks2D
 from acino_fte.errors import InputError
 
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 _CAMERA_FILES = ("cameras.json", "cameras.toml", "calibration.toml")
 _DLT = re.compile(r".*dlt.*coef.*\.(csv|txt)", re.IGNORECASE)
 _TRUTH_3D, _TRUTH = "truth_3d.csv", "_truth"
-_TABLES = (".csv", ".tsv", ".h5", ".hdf5", ".npz", ".npy")
-_NO_TRACKS = re.compile(r".*(_truth|xyzpts|xyzres|xyzci|xyzfilt|offsets)|truth_3d.*", re.IGNORECASE)
 
 Given = Path | str | Sequence[Path | str] | Mapping[str, Path | str]
 
@@ -178,12 +176,16 @@ def _at_least_two(rig: CameraArray, file: Path) -> None:
 def _find(folder: Path, rig: CameraArray, used: Sequence[Path]) -> Given:
     """What holds the tracks: one file for all cameras, or those of each camera."""
     here = [p for p in sorted(folder.iterdir()) if not p.name.startswith(".") and p not in used]
-    files = [p for p in here if p.suffix.lower() in _TABLES and not _NO_TRACKS.fullmatch(p.stem)]
+    files = [p for p in here if p.suffix.lower() in TABLES and not NO_TRACKS.fullmatch(p.stem)]
     files = [p for p in files if not _DLT.fullmatch(p.name)]
     digitised = [p for p in files if is_xypts(p)]
     if digitised:
         return _only(digitised, folder)
-    named = [p for p in (*files, *filter(_is_export, here)) if len(cameras_of(_stem(p), rig.names)) == 1]
+    named = [
+        p
+        for p in (*files, *filter(export_files, filter(Path.is_dir, here)))
+        if len(cameras_of(_stem(p), rig.names)) == 1
+    ]
     strangers = [p for p in files if p not in named and looks_like_camera(_stem(p))]
     if named or strangers:
         seen = {cameras_of(_stem(p), rig.names)[0] for p in named}
@@ -261,7 +263,7 @@ def _by_name(views: Mapping[str, Tracks2D], rig: CameraArray, path: Path) -> dic
 def _read_view(paths: Sequence[Path], camera: str, options: _Options) -> Tracks2D:
     """The dots of one camera, from a table, an export or a folder with one."""
     if len(paths) == 1 and paths[0].is_dir():
-        paths = _export(paths[0]) or paths
+        paths = export_files(paths[0]) or paths
     kinds = {exporter(path) for path in paths}
     if kinds == {"trex"}:
         return read_trex(paths, camera, cm_per_pixel=options.cm_per_pixel)
@@ -292,24 +294,6 @@ def _read_view(paths: Sequence[Path], camera: str, options: _Options) -> Tracks2
         return view
     n_rows = len(view) + (0 if view.left_out is None else len(view.left_out))
     return replace(view, animal=read_true_animals(truth, n_rows, view.row))
-
-
-def _is_export(path: Path) -> bool:
-    return path.is_dir() and bool(_export(path))
-
-
-def _export(folder: Path) -> list[Path]:
-    """What a tracker left in a folder: the session of idtracker.ai, or TRex's files."""
-    session = session_file(folder)
-    if session is not None:
-        return [session]
-    for place in (folder, folder / "data"):
-        found = sorted(
-            p for ending in ("npz", "csv") for p in place.glob(f"*.{ending}") if exporter(p) == "trex"
-        )
-        if found:
-            return [p for p in found if p.suffix == found[-1].suffix]
-    return []
 
 
 def _stem(path: Path) -> str:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.collections import LineCollection
 
+from acino_fte.data_tools.colours import colours_of
 from acino_fte.data_tools.match_points import SOURCE_NAMES, SpacePoints
-from acino_fte.data_tools.plots_tracks_style import NAMED, colours_of, legend, new_track_figure, runs
+from acino_fte.data_tools.plots_tracks_style import NAMED, legend, new_track_figure, runs
 from acino_fte.plots_style import GREY, blank
 from acino_fte.report_scene import ground_grid
 

@@ -1,4 +1,4 @@
-"""What the figures of a matching share: the title, and a colour for each animal."""
+"""What the figures of a matching share."""
 
 from __future__ import annotations
 
@@ -6,38 +6,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from acino_fte.plots_style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
+from acino_fte.plots_style import GREY
 
 if TYPE_CHECKING:
     from acino_fte.data_tools.track_matching import TrackMatches
 
-DISTINCT = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, "#000000")
 NAMED = 25
 """With more animals than this, their numbers are not written."""
-_DARKEST, _PALEST = 0.0, 0.9
-_GOLDEN = 0.6180339887498949
-
-
-def colours_of(n: int) -> np.ndarray:
-    """A colour (n, 3) for each of n animals or cameras.
-
-    Up to seven are those of Okabe and Ito (2008), up to 21 also their dark and their pale tones. More lie
-    along an even, colour-blind safe scale, those of successive numbers far apart (the golden section).
-    """
-    pure = np.array([to_rgb(c) for c in DISTINCT])
-    tones = np.concatenate(
-        [pure, np.where(pure.any(1, keepdims=True), 0.55 * pure, 0.35), 0.45 * pure + 0.55]
-    )
-    if n <= len(tones):
-        return tones[:n]
-    place = np.arange(n) * _GOLDEN % 1.0
-    rank = np.argsort(np.argsort(place)) / (n - 1)
-    return colormaps["viridis"](_DARKEST + (_PALEST - _DARKEST) * rank)[:, :3]
 
 
 def new_track_figure(

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.collections import LineCollection
 
+from acino_fte.data_tools.colours import colours_of
 from acino_fte.data_tools.match_points import SpacePoints
-from acino_fte.data_tools.plots_tracks_style import colours_of, legend, new_track_figure, runs
+from acino_fte.data_tools.plots_tracks_style import legend, new_track_figure, runs
 from acino_fte.plots_style import blank, margins
 
 if TYPE_CHECKING:

@@ -9,8 +9,9 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 
+from acino_fte.data_tools.colours import colours_of
 from acino_fte.data_tools.match_points import SpacePoints, predicted_pixels
-from acino_fte.data_tools.plots_tracks_style import NAMED, colours_of, legend, new_track_figure, runs
+from acino_fte.data_tools.plots_tracks_style import NAMED, legend, new_track_figure, runs
 from acino_fte.plots_style import BLUE, margins, nothing
 
 if TYPE_CHECKING:

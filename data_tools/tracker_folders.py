@@ -1,7 +1,4 @@
-"""What trackers leave in a folder, and which files of a folder may hold tracks at all.
-
-The same rules as in :mod:`load_tracks`, without what it has to import.
-"""
+"""What trackers leave in a folder, and which files of a folder may hold tracks at all."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """2D tracks of individuals for a scene: one file for each camera, or one table for all.
 
-Cameras and tracks are joined by name, individuals over cameras by their label. ``docs/scene_tracks.md`` says
+Cameras and tracks are joined by name, individuals over cameras by their label. ``docs/scene_formats.md`` says
 what the files may hold.
 """
 

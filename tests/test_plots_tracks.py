@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PatchCollection
 
+from acino_fte.data_tools.colours import colours_of
 from acino_fte.data_tools.match_numbers import match_metrics
 from acino_fte.data_tools.match_page import viewer_data, write_match_page
 from acino_fte.data_tools.match_points import SOURCE_NAMES, SpacePoints, space_points
 from acino_fte.data_tools.plots_tracks import FIGURES, save_track_figures
 from acino_fte.data_tools.plots_tracks_pairs import matrix_figure, residual_figure
 from acino_fte.data_tools.plots_tracks_space import space_figure, track_lines
-from acino_fte.data_tools.plots_tracks_style import colours_of, runs
+from acino_fte.data_tools.plots_tracks_style import runs
 from acino_fte.data_tools.plots_tracks_time import timeline_figure
 from acino_fte.data_tools.plots_tracks_views import overlay_figure
 from acino_fte.data_tools.simulate_tracks import TrackSimulation, simulate_tracks
