@@ -14,7 +14,8 @@ from synthetic_result import make_result, triangulated, with_estimates
 from acino_fte import result_files
 from acino_fte.errors import InputError
 from acino_fte.result import Status
-from acino_fte.result_files import check_output_folder, save_result, to_dataset
+from acino_fte.result_dataset import to_dataset
+from acino_fte.result_files import check_output_folder, save_result
 
 
 @pytest.fixture(scope="module")
