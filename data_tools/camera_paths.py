@@ -30,7 +30,8 @@ _FORESEEN, _MEDIAN = (
     2.5,
     0.79,
 )  # of χ²/3: how far off key frames may be from what the others predict; its median
-_MISPLACED = 50.0  # squared distance of a key frame from what the others predict, in units of the usual
+_SUSPECT, _MISPLACED = 10.0, 50.0  # squared distance of a key frame from where the others have it, as usual
+_ROUNDS = 5  # of looking for misplaced key frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,18 +132,16 @@ def camera_path(
         return _standing(camera, float(turn[0]), float(shift[0]), noise.shape, frames)
     if max_gap is None:
         max_gap = GAP_STEPS * float(np.median(np.diff(camera.frame)))
-    keep = np.ones(len(camera.frame), dtype=bool)
-    for _ in range(2):  # all key frames, and those that fit together
-        keys = np.flatnonzero(keep)
+    keys = np.arange(len(camera.frame))
+    for _ in range(_ROUNDS):
         time, rotation = camera.frame[keys], Rotation.from_matrix(camera.rotation[keys])
-        unrolled = unroll(rotation)
-        centres = _curve(time, camera.centre[keys], shift[keys], max_gap)
+        place, unrolled = camera.centre[keys], unroll(rotation)
+        centres = _curve(time, place, shift[keys], max_gap)
         turns = _curve(time, unrolled, turn[keys], max_gap)
-        misplaced = _misplaced(centres, camera.centre[keys], shift[keys])
-        misplaced |= _misplaced(turns, unrolled, turn[keys])
-        if not misplaced.any() or (~misplaced).sum() < 4:
+        wrong = _misplaced(centres, place, shift[keys]) | _misplaced(turns, unrolled, turn[keys], rotation)
+        if not wrong.any():
             break
-        keep[keys[misplaced]] = False
+        keys = keys[~wrong]
     frame = np.arange(time[0], time[-1] + 1)
     centre, centre_variance = centres.at(frame)
     angles, turn_variance = turns.at(frame)
@@ -209,10 +208,36 @@ def _turned(
     return Rotation.from_rotvec(angles - through) * between
 
 
-def _misplaced(path: WienerPath, points: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Key frames (K,) far from what the others predict, against how far they usually are."""
+def _misplaced(
+    path: WienerPath, points: np.ndarray, noise: np.ndarray, rotation: Rotation | None = None
+) -> np.ndarray:
+    """Key frames (K,) far from where the others predict them; of angles with the rotations they stand for.
+
+    A misplaced key frame makes the curve so rough that nothing seems far from it. So key frames further off
+    than their neighbours, and than is usual, are held against the curve through the others alone. Where that
+    is rough as well, the camera moved suddenly.
+    """
+    wrong = np.zeros(len(points), dtype=bool)
     distance = path.deleted_distance(points, noise)
-    return distance > _MISPLACED * max(float(np.median(distance)), 1.0)
+    beside = np.maximum(np.append(distance[1:], 0.0), np.append(0.0, distance[:-1]))
+    suspect = (distance >= beside) & (distance > _SUSPECT * float(np.median(distance)))
+    which, rest = np.flatnonzero(suspect), np.flatnonzero(~suspect)
+    if not len(which) or len(rest) < 4:
+        return wrong
+    others = points[rest] if rotation is None else unroll(rotation[rest])
+    curve = fit_wiener_path(path.time[rest], others, noise[rest])
+    mean, variance = curve.at(path.time[which])
+    off = points[which] - mean
+    before = np.maximum(np.searchsorted(rest, which) - 1, 0)
+    if rotation is not None:
+        step = Rotation.from_rotvec(np.nan_to_num(mean - others[before]))
+        found = (rotation[which] * (step * rotation[rest[before]]).inv()).as_rotvec()
+        off = np.where(np.isfinite(mean), found, np.nan)
+    left = curve.deleted_distance(others, noise[rest])
+    usual = float(np.median(left))
+    wrong[which] = (off**2).mean(1) > _MISPLACED * max(usual, 1.0) * (variance + noise[which])
+    wrong[which] &= np.maximum(left[before], left[np.minimum(before + 1, len(rest) - 1)]) < _SUSPECT * usual
+    return wrong
 
 
 def _nearest_known(known: np.ndarray) -> np.ndarray:

@@ -256,7 +256,7 @@ class _Averaging:
         far, count = self._far(), self._used.sum(1)[:, None]
         worst = far >= np.where(self._used, far, 0.0).max(1)[:, None]
         used = np.where((far > 1.0) & worst & (count > 2), False, self._used) | (self._seen & (far <= 1.0))
-        sure = ~(used & (far > 1.0)).any(1)
+        sure = np.asarray(~(used & (far > 1.0)).any(1))
         changed = bool((used != self._used).any() or (sure != self._sure).any())
         self._used, self._sure = used, sure
         return changed
