@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -206,7 +207,7 @@ def scene(
 
     Example: acino-fte scene recording/ --scale 1-3=0.6 -o out/wand
     """
-    with reported_errors(), ExitStack() as stack:
+    with reported_errors(), _uncollected(), ExitStack() as stack:
         target = _target(folder, out)
         kinds = _formats(formats)
         given = SceneOptions(
@@ -270,6 +271,18 @@ def scene(
             "and that two cameras see one individual at one time"
         )
         raise typer.Exit(EXIT_OTHER)
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """No garbage collection meanwhile: it takes a twentieth of the time and finds next to nothing."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,6 @@ and ligatures that figures do not use. Letters that the light font lacks are tak
 
 from __future__ import annotations
 
-import atexit
-import shutil
-import tempfile
 from pathlib import Path
 
 WHOLE, LIGHT = "DejaVu Sans", "acino_fte Sans"
@@ -17,8 +14,13 @@ _UNUSED = ["GSUB", "GPOS", "GDEF", "FFTM", "PfEd", "BDF", "meta"]
 _FAMILY = (1, 16)  # entries of a font's table of names
 
 
-def add_light_font() -> list[str]:
-    """Make the light font known to matplotlib for as long as this process lives.
+def add_light_font(folder: Path) -> list[str]:
+    """Make the light font and tell matplotlib, in this process, of it.
+
+    Parameters
+    ----------
+    folder : Path
+        For the file, which is needed as long as figures are drawn.
 
     Returns
     -------
@@ -39,8 +41,6 @@ def add_light_font() -> list[str]:
     for entry in font["name"].names:
         if entry.nameID in _FAMILY:
             entry.string = LIGHT
-    folder = Path(tempfile.mkdtemp(prefix="acino_fte-font-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     path = folder / "light.ttf"
     subset.save_font(font, str(path), options)
     font_manager.fontManager.addfont(str(path))

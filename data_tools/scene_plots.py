@@ -79,8 +79,13 @@ def save_scene_figures(drawing: SceneDrawing, folder: Path, families: list[str] 
     return written
 
 
-def prepare() -> list[str]:
+def prepare(folder: Path) -> list[str]:
     """Do what the first figure would wait for: canvases, fonts.
+
+    Parameters
+    ----------
+    folder : Path
+        For what figures need as long as they are drawn.
 
     Returns
     -------
@@ -91,7 +96,7 @@ def prepare() -> list[str]:
 
     from acino_fte.data_tools.light_font import add_light_font
 
-    families = add_light_font()
+    families = add_light_font(folder)
     style: Any = {**dict(matplotlib.rcParamsDefault), **STYLE, "font.family": families}
     with matplotlib.rc_context(style):
         figure = Figure(figsize=(1, 1))

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -562,6 +563,7 @@ def test_a_process_that_is_not_needed_any_more_ends(result, tmp_path, monkeypatc
     with FigureProcess() as idle:
         pass
     assert gone(idle)
+    assert not Path(idle._folder.name).exists()
     with pytest.raises(InputError), FigureProcess() as busy:
         busy.draw(drawing_of(result), tmp_path / "figures")
         raise InputError("something else went wrong")

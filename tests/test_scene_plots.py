@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from test_scene_files import NoFigures, nobody, scene_result
 
-from acino_fte.data_tools import plots_tracks_style
-from acino_fte.data_tools.colours import colours_of
+from acino_fte.data_tools.colours import colours_of, hex_colours
 from acino_fte.data_tools.page_parts import script_json
 from acino_fte.data_tools.scene_drawing import SceneDrawing, scene_drawing, thinned
 from acino_fte.data_tools.scene_files import save_scene
@@ -200,14 +199,18 @@ def test_figures_are_files_whatever_the_user_s_style(drawing, tmp_path):
 @pytest.mark.parametrize(("name", "n_fonts"), [("Zoë", 1), ("Ωmega", 2)])
 def test_a_light_font_is_embedded_and_lends_letters_from_the_whole_one(tmp_path, name, n_fonts):
     result = scene_result(n_frames=70, names=("Ann", name))
-    files = save_scene_figures(scene_drawing(result), tmp_path, prepare())
+    files = save_scene_figures(scene_drawing(result), tmp_path / "figures", prepare(tmp_path))
     embedded = next(p for p in files if p.suffix == ".pdf").read_bytes()
     assert embedded.count(b"/FontFile2") == n_fonts  # TrueType
 
 
 @pytest.mark.parametrize("n", [0, 1, 7, 21, 22, 60])
-def test_colours_are_those_of_the_matching(n):
-    np.testing.assert_allclose(colours_of(n), plots_tracks_style.colours_of(n), atol=1e-12)
+def test_every_individual_has_a_colour_of_its_own(n):
+    colours = colours_of(n)
+    assert colours.shape == (n, 3)
+    assert len(np.unique(np.round(255 * colours), axis=0)) == n
+    assert ((colours >= 0) & (colours <= 1)).all()
+    assert hex_colours(n)[:2] == ["#0072b2", "#e69f00"][:n] or n > 21
 
 
 def test_thinning_keeps_both_ends():
