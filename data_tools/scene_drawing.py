@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from acino_fte.data_tools.scene import SceneResult
 
 _MOST_CLOUD = 3000  # points of the cloud in a figure
+_PATIENCE = 600.0  # s
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from acino_fte.data_tools.scene_drawing import serve; serve()"
@@ -152,7 +153,7 @@ class FigureProcess:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
             )
-        except (OSError, ValueError):
+        except (OSError, ValueError, TypeError):  # no interpreter that can be started
             self._process = None
         return self
 
@@ -169,7 +170,7 @@ class FigureProcess:
         """Until the figures are there; they are drawn here when the process did not draw them."""
         if self._asked is None:
             return
-        if self._process is not None and self._process.wait() == 0:
+        if self._process is not None and _drawn(self._process):
             return
         from acino_fte.data_tools.scene_plots import save_scene_figures
 
@@ -190,6 +191,14 @@ class FigureProcess:
             self._thread.join()
         elif process.stdin is not None:
             _close(process.stdin)
+
+
+def _drawn(process: subprocess.Popen[bytes]) -> bool:
+    """Whether the process has done its work; it is not waited for without end."""
+    try:
+        return process.wait(_PATIENCE) == 0
+    except subprocess.TimeoutExpired:
+        return False
 
 
 def _send(process: subprocess.Popen[bytes], data: bytes) -> None:

@@ -37,10 +37,10 @@ def scene_metrics(
     Returns
     -------
     dict
-        status, scene, options, individuals, frames (half-open), fps, n_cameras, cameras (rows, used rows, key
-        frames of each), n_points (all, by source), points_3d, reprojection_px, distances_m (between
-        individuals), noise_px, rigs, scale, axes, time_offsets, world_from_model, warnings, what
-        ``result.numbers`` adds, and with truth truth_mm.
+        status, scene, options, individuals, frames (half-open), fps, n_cameras, unit (of lengths), cameras
+        (rows, used rows, key frames of each), n_points (all, by source), points_3d, reprojection_px,
+        distances (between individuals), noise_px, rigs, scale, axes, time_offsets, world_from_model,
+        warnings, what ``result.numbers`` adds, and with truth truth_mm.
     """
     scene, tracks = result.scene, result.tracks
     seen = [view.frame for view in scene.tracks if len(view)] or [np.zeros(0, dtype=int)]
@@ -54,11 +54,12 @@ def scene_metrics(
         "frames": [int(frame.min()), int(frame.max()) + 1] if len(frame) else [0, 0],
         "fps": scene.fps,
         "n_cameras": len(scene.cameras),
+        "unit": "m" if result.numbers.get("scale") else "model units",
         "cameras": _cameras(result),
         "n_points": _counts(tracks),
         "points_3d": _spread(tracks),
         "reprojection_px": _reprojection(result),
-        "distances_m": individual_distances(tracks),
+        "distances": individual_distances(tracks),
         "noise_px": result.noise_px,
         "rigs": [],
         "scale": None,
@@ -106,10 +107,10 @@ def _counts(tracks: SceneTracks) -> dict[str, int]:
 
 
 def _spread(tracks: SceneTracks) -> dict[str, Any]:
-    """Median standard deviation of a position, all three axes together, mm: of all points and by source."""
-    sd = 1000.0 * np.linalg.norm(tracks.standard_deviation, axis=1)
+    """Median standard deviation of a position, all three axes together: of all points and by source."""
+    sd = np.linalg.norm(tracks.standard_deviation, axis=1)
     by_source = {name: median(sd[tracks.source == k]) for k, name in enumerate(SOURCES)}
-    return {"smooth": tracks.smooth, "median_sd_mm": median(sd), "median_sd_mm_by_source": by_source}
+    return {"smooth": tracks.smooth, "median_sd": median(sd), "median_sd_by_source": by_source}
 
 
 def _reprojection(result: SceneResult) -> dict[str, Any]:
@@ -211,9 +212,9 @@ def summary(metrics: dict[str, Any]) -> list[str]:
     lines += _world(metrics)
     lines += _clocks(metrics["time_offsets"])
     lines += [
-        f"distance {' – '.join(pair['individuals'])}: {pair['mean']:.4f} m ± {1000 * pair['sd']:.1f} mm "
+        f"distance {' – '.join(pair['individuals'])}: {_length(pair, metrics['unit'])} "
         f"over {pair['count']} frames"
-        for pair in metrics["distances_m"][:3]
+        for pair in metrics["distances"][:3]
     ]
     lines += _truth(metrics.get("truth_mm"))
     lines.append(f"done in {metrics['seconds']['total']:.2f} s")
@@ -224,6 +225,13 @@ def upright_by(metrics: dict[str, Any]) -> str | None:
     """What the scene is upright by; None when its axes are those of the model."""
     how = (metrics["axes"] or {}).get("how")
     return None if how in (None, _OWN_AXES) else str(how)
+
+
+def _length(pair: dict[str, Any], unit: str) -> str:
+    """A distance and its scatter."""
+    if unit == "m":
+        return f"{pair['mean']:.4f} m ± {1000 * pair['sd']:.1f} mm"
+    return f"{pair['mean']:.5g} ± {pair['sd']:.2g} {unit}"
 
 
 def _count(n: int, word: str) -> str:

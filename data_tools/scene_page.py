@@ -211,10 +211,12 @@ def _numbers(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         sd = scale.get("sd")
         text = "metres per unit of the model" + (f" ± {100 * sd / scale['factor']:.2g} %" if sd else "")
         entries.append((f"{scale['factor']:.5g}", text))
-        entries.append((number(metrics["points_3d"]["median_sd_mm"], "mm", 1), "median sd of a position"))
+        spread = metrics["points_3d"]["median_sd"]
+        spread = None if spread is None else 1000.0 * spread
+        entries.append((number(spread, "mm", 1), "median sd of a position"))
     entries += [
         (f"{pair['mean']:.4f} {'m' if scale else ''}".strip(), f"from {' to '.join(pair['individuals'])}")
-        for pair in metrics["distances_m"][:1]
+        for pair in metrics["distances"][:1]
     ]
     truth = metrics.get("truth_mm")
     if truth:
@@ -272,6 +274,6 @@ def _distances(metrics: dict[str, Any]) -> str:
             number(pair["sd"], unit, 4),
             f"{pair['count']:,}",
         )
-        for pair in metrics["distances_m"]
+        for pair in metrics["distances"]
     ]
     return table(("individuals", "distance, mean", "sd", "frames"), rows) if rows else ""

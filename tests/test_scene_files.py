@@ -390,7 +390,7 @@ def test_metrics_count_what_is_there(saved, result):
 
 
 def test_distances_between_individuals_need_both(result):
-    pair = scene_metrics(result)["distances_m"][0]
+    pair = scene_metrics(result)["distances"][0]
     both = [f for f in range(100, 190) if not (150 <= f < 155 or 110 <= f < 120 or 160 <= f < 164)]
     assert pair["individuals"] == ["bird 0", "bird 1"]
     assert pair["count"] == len(both)
@@ -408,7 +408,9 @@ def test_summary_says_what_users_ask(saved):
 
 def test_without_scale_no_metres_are_claimed(tmp_path):
     metrics = save_scene(scene_result(scale=False), tmp_path / "out", figures=NoFigures())
-    assert "no scale" in "\n".join(summary(metrics))
+    said = "\n".join(summary(metrics))
+    assert "no scale" in said and " m " not in said and "mm" not in said
+    assert metrics["unit"] == "model units"
     assert "not metres" in (tmp_path / "out" / "report.html").read_text()
     with xr.open_dataset(tmp_path / "out" / "tracks_3d.nc", engine="h5netcdf") as dataset:
         assert dataset.attrs["space_unit"] == "model units"
@@ -542,12 +544,17 @@ def test_a_process_draws(result, tmp_path):
     }
 
 
-@pytest.mark.parametrize("fault", ["dies", "is not there"])
+@pytest.mark.parametrize("fault", ["dies", "is not there", "hangs", "is none"])
 def test_figures_are_drawn_here_when_the_process_fails(result, tmp_path, monkeypatch, fault):
     drawn = []
     monkeypatch.setattr("acino_fte.data_tools.scene_plots.save_scene_figures", lambda *a: drawn.append(a))
     if fault == "dies":
         monkeypatch.setattr(scene_drawing, "_CHILD", "raise SystemExit(3)")
+    elif fault == "hangs":
+        monkeypatch.setattr(scene_drawing, "_CHILD", "import time; time.sleep(60)")
+        monkeypatch.setattr(scene_drawing, "_PATIENCE", 0.1)
+    elif fault == "is none":
+        monkeypatch.setattr(scene_drawing.sys, "executable", None)
     else:
         monkeypatch.setattr(scene_drawing.sys, "executable", str(tmp_path / "no-python"))
     drawing = drawing_of(result)
