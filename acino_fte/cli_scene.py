@@ -198,12 +198,13 @@ def scene(
         bool, typer.Option("--quiet", "-q", help="Print errors and warnings only.", rich_help_panel=_OUTPUT)
     ] = False,
 ) -> None:
-    """Rebuild 3D tracks of animals that moving cameras saw, from the COLMAP model and 2D tracks in a FOLDER.
+    """Rebuild 3D tracks of animals in moving cameras from a COLMAP model and 2D tracks.
 
-    Writes tracks_3d.csv (metres, upright, with standard deviations), observations.csv, camera_paths.csv,
-    metrics.json, the layouts of movement and PLY, figures and a report that turns in the browser. Leaves with
-    0 when there are tracks, 2 when the input is wrong, 1 for anything else (and when nothing could be
-    triangulated).
+    Writes tracks_3d.csv (metres, upright, with standard deviations),
+    observations.csv, camera_paths.csv, metrics.json, the layouts of movement and
+    PLY, figures and a report that turns in the browser. Leaves with 0 when there
+    are tracks, 2 when the input is wrong, 1 for anything else (and when nothing
+    could be triangulated).
 
     Example: acino-fte scene recording/ --scale 1-3=0.6 -o out/wand
     """

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 TRIANGULATED, NOTHING = "triangulated", "nothing_triangulated"
 _OWN_AXES = "the model's own axes"  # as scene_axes says it
+_STEADY = 0.1  # scatter of a distance, of its mean
 MOST_PAIRS = 15
 """Distances between individuals are listed when there are no more pairs than this."""
 
@@ -214,7 +215,7 @@ def summary(metrics: dict[str, Any]) -> list[str]:
     lines += [
         f"distance {' – '.join(pair['individuals'])}: {_length(pair, metrics['unit'])} "
         f"over {pair['count']} frames"
-        for pair in metrics["distances"][:3]
+        for pair in steady_distances(metrics)[:3]
     ]
     lines += _truth(metrics.get("truth_mm"))
     lines.append(f"done in {metrics['seconds']['total']:.2f} s")
@@ -225,6 +226,11 @@ def upright_by(metrics: dict[str, Any]) -> str | None:
     """What the scene is upright by; None when its axes are those of the model."""
     how = (metrics["axes"] or {}).get("how")
     return None if how in (None, _OWN_AXES) else str(how)
+
+
+def steady_distances(metrics: dict[str, Any]) -> list[dict[str, Any]]:
+    """The distances that stay about the same, as between the ends of a wand."""
+    return [pair for pair in metrics["distances"] if pair["sd"] < _STEADY * pair["mean"]]
 
 
 def _length(pair: dict[str, Any], unit: str) -> str:

@@ -19,7 +19,7 @@ from acino_fte.data_tools.page_parts import (
     write_page,
 )
 from acino_fte.data_tools.scene_drawing import thinned
-from acino_fte.data_tools.scene_numbers import upright_by
+from acino_fte.data_tools.scene_numbers import steady_distances, upright_by
 from acino_fte.data_tools.scene_tracks import SOURCES, SceneTracks
 from acino_fte.data_tools.scene_viewer import viewer_html
 from acino_fte.report_scene import ground_grid
@@ -216,7 +216,7 @@ def _numbers(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         entries.append((number(spread, "mm", 1), "median sd of a position"))
     entries += [
         (f"{pair['mean']:.4f} {'m' if scale else ''}".strip(), f"from {' to '.join(pair['individuals'])}")
-        for pair in metrics["distances"][:1]
+        for pair in steady_distances(metrics)[:1]
     ]
     truth = metrics.get("truth_mm")
     if truth:

@@ -398,6 +398,18 @@ def test_distances_between_individuals_need_both(result):
     assert pair["mean"] == pytest.approx(length.mean(), abs=SD)
 
 
+def test_summary_tells_of_distances_that_are_steady():
+    pairs = [
+        {"individuals": ["a", "b"], "mean": 0.5, "sd": 0.002, "count": 7},
+        {"individuals": ["a", "c"], "mean": 0.5, "sd": 0.2, "count": 8},
+    ]
+    said = "\n".join(
+        summary({**scene_metrics(scene_result(n_frames=80)), "distances": pairs, "seconds": {"total": 1.0}})
+    )
+    assert "distance a – b: 0.5000 m ± 2.0 mm over 7 frames" in said
+    assert "a – c" not in said
+
+
 def test_summary_says_what_users_ask(saved):
     said = "\n".join(summary(saved[1]))
     for part in ("2 individuals in 90 frames of 3 cameras", "reprojection", "noise 1.25 px", "scale 2.5 m"):
