@@ -166,8 +166,8 @@ def sum_of_each(values: np.ndarray, index: np.ndarray, n: int) -> np.ndarray:
 
 
 def median_of_chi2(freedom: np.ndarray) -> np.ndarray:
-    """Median of χ² over its degrees of freedom (Wilson and Hilferty 1931)."""
-    return (1.0 - 2.0 / (9.0 * freedom)) ** 3
+    """Median of χ² over its degrees of freedom (Wilson and Hilferty 1931; exact for one)."""
+    return np.where(freedom == 1, 0.45494, (1.0 - 2.0 / (9.0 * freedom)) ** 3)
 
 
 def _in_groups(from_poses: np.ndarray, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -183,15 +183,20 @@ def _best_line(
     level: np.ndarray, typical: np.ndarray, relative: np.ndarray, px: float | None, usual_px: float
 ) -> tuple[float, float]:
     """σ² and κ of typical = σ² + κ level, with relative errors of the typical values (G,)."""
-    weight = 1.0 / (relative * np.maximum(typical, NOISE_FLOOR**2))
-    rest = typical - _OWN[:, None] * level  # what is left for σ², (κ, G)
-    variance = np.maximum((rest * weight**2).sum(1) / (weight**2).sum(), NOISE_FLOOR**2)
-    if px is not None:
-        variance = np.full(len(_OWN), px**2)
-    cost = (((rest - variance[:, None]) * weight) ** 2).sum(1) + (np.log(_OWN) / _BROAD_OWN) ** 2
-    if np.isfinite(usual_px) and px is None:
-        cost += (0.5 * np.log(variance / max(usual_px, NOISE_FLOOR) ** 2) / _BROAD_PX) ** 2
-    best = int(np.argmin(cost))
+    expected = np.full(len(level), max(float(np.mean(typical)), NOISE_FLOOR**2))
+    for _ in range(
+        3
+    ):  # the errors are relative to what is expected: found values that are small are not surer
+        weight = 1.0 / (relative * expected)
+        rest = typical - _OWN[:, None] * level  # what is left for σ², (κ, G)
+        variance = np.maximum((rest * weight**2).sum(1) / (weight**2).sum(), NOISE_FLOOR**2)
+        if px is not None:
+            variance = np.full(len(_OWN), px**2)
+        cost = (((rest - variance[:, None]) * weight) ** 2).sum(1) + (np.log(_OWN) / _BROAD_OWN) ** 2
+        if np.isfinite(usual_px) and px is None:
+            cost += (0.5 * np.log(variance / max(usual_px, NOISE_FLOOR) ** 2) / _BROAD_PX) ** 2
+        best = int(np.argmin(cost))
+        expected = variance[best] + _OWN[best] * level
     return float(variance[best]), float(_OWN[best])
 
 
