@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 pytest.importorskip("pycolmap")
 
 from acino_fte.cli import app
-from acino_fte.cli_scene import _gap, _rig
+from acino_fte.cli_scene_input import gap_frames, rig_choice
 from acino_fte.data_tools.scene_files import SCENE
 from acino_fte.data_tools.scene_folder import write_scene
 from acino_fte.data_tools.scene_settings import SceneSettings, read_scene_settings
@@ -256,14 +256,14 @@ def test_figures_that_were_begun_end_with_an_error(recording, here):
 
 
 def test_how_gaps_and_rigs_are_written():
-    assert _gap("--max-gap", "1.5s", 30.0) == 45
-    assert _gap("--max-gap", "40", None) == 40
-    assert _gap("--max-gap", None, None) is None
-    assert _rig("Auto") == "auto"
-    assert _rig("a, b; c,d") == (("a", "b"), ("c", "d"))
+    assert gap_frames("--max-gap", "1.5s", 30.0) == 45
+    assert gap_frames("--max-gap", "40", None) == 40
+    assert gap_frames("--max-gap", None, None) is None
+    assert rig_choice("Auto") == "auto"
+    assert rig_choice("a, b; c,d") == (("a", "b"), ("c", "d"))
     for wrong in ("", "a", "a,b;c"):
         with pytest.raises(InputError):
-            _rig(wrong)
+            rig_choice(wrong)
 
 
 def test_help_names_every_group():
