@@ -1,10 +1,12 @@
-"""What all commands share: the consoles, and errors turned into messages and exit codes."""
+"""What all commands share: consoles, errors turned into messages and exit codes, clock and spinner."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import typer
 from rich.console import Console
@@ -39,3 +41,61 @@ def warn(message: str) -> None:
 def on_terminal() -> bool:
     """Whether progress should be shown."""
     return sys.stderr.isatty()
+
+
+def chosen_formats(text: str, known: Sequence[str]) -> tuple[str, ...]:
+    """The formats in a text with commas, in the order of the known ones; ``csv`` is always written.
+
+    Raises
+    ------
+    InputError
+        One of them is not known.
+    """
+    names = [name.strip().lower() for name in text.split(",") if name.strip()]
+    wrong = [name for name in names if name not in (*known, "csv")]
+    if wrong:
+        raise InputError(
+            "This format is not known.",
+            key="--format",
+            expected=f"some of csv, {', '.join(known)}, with commas between them",
+            found=", ".join(wrong),
+        )
+    return tuple(name for name in known if name in names)
+
+
+@dataclass
+class Clock:
+    """Seconds of every step; a step that comes again is added up."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    _name: str = ""
+    _begun: float = 0.0
+
+    def begin(self, name: str) -> None:
+        """End the step under way and begin another."""
+        self.end()
+        self._name, self._begun = name, time.perf_counter()
+
+    def end(self) -> None:
+        """End the step under way."""
+        if self._name:
+            passed = time.perf_counter() - self._begun
+            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + passed
+        self._name = ""
+
+
+@contextmanager
+def spinner(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """The step under way and the time so far, on a terminal; nothing in a pipe."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    with Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        console=stderr,
+        transient=True,
+        disable=quiet or not on_terminal(),
+    ) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda text: bar.update(task, description=escape(text))

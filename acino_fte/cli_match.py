@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from acino_fte.cli_common import EXIT_OTHER, on_terminal, reported_errors, stderr, stdout, warn
+from acino_fte.cli_common import (
+    EXIT_OTHER,
+    Clock,
+    chosen_formats,
+    reported_errors,
+    spinner,
+    stderr,
+    stdout,
+    warn,
+)
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:
@@ -207,9 +214,9 @@ def match(
     """
     with reported_errors():
         target = _target(folder, out)
-        kinds = _formats(formats)
-        clock = _Clock()
-        with _spinner(quiet) as show:
+        kinds = chosen_formats(formats, _known_formats())
+        clock = Clock()
+        with spinner(quiet) as show:
 
             def tell(step: str) -> None:
                 clock.begin(step)
@@ -280,19 +287,10 @@ def _target(folder: Path, out: Path | None) -> Path:
     return check_output_folder(out, input_folder=folder if folder.exists() else None, contents=MATCHING)
 
 
-def _formats(text: str) -> tuple[str, ...]:
+def _known_formats() -> tuple[str, ...]:
     from acino_fte.data_tools.match_files import FORMATS
 
-    names = [name.strip().lower() for name in text.split(",") if name.strip()]
-    wrong = [name for name in names if name not in (*FORMATS, "csv")]
-    if wrong:
-        raise InputError(
-            "This format is not known.",
-            key="--format",
-            expected=f"some of csv, {', '.join(FORMATS)}, with commas between them",
-            found=", ".join(wrong),
-        )
-    return tuple(name for name in FORMATS if name in names)
+    return FORMATS
 
 
 def _match_options(
@@ -329,41 +327,3 @@ def _match(recording: TrackRecording, options: Any, bare: bool, tell: Callable[[
         return thesis_matches(recording, options, tell)
     views = tuple(view.without_tracks() for view in recording.views)
     return replace(thesis_matches(replace(recording, views=views), options, tell), recording=recording)
-
-
-@dataclass
-class _Clock:
-    """Seconds of every step; a step that comes again is added up."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    _name: str = ""
-    _begun: float = 0.0
-
-    def begin(self, name: str) -> None:
-        """End the step under way and begin another."""
-        self.end()
-        self._name, self._begun = name, time.perf_counter()
-
-    def end(self) -> None:
-        """End the step under way."""
-        if self._name:
-            passed = time.perf_counter() - self._begun
-            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + passed
-        self._name = ""
-
-
-@contextmanager
-def _spinner(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """The step under way and the time so far, on a terminal; nothing in a pipe."""
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    with Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        TimeElapsedColumn(),
-        console=stderr,
-        transient=True,
-        disable=quiet or not on_terminal(),
-    ) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda text: bar.update(task, description=escape(text))

@@ -13,10 +13,17 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from acino_fte.cli_common import EXIT_OTHER, reported_errors, stderr, stdout, warn
-from acino_fte.cli_match import _Clock, _spinner
+from acino_fte.cli_common import (
+    EXIT_OTHER,
+    Clock,
+    chosen_formats,
+    reported_errors,
+    spinner,
+    stderr,
+    stdout,
+    warn,
+)
 from acino_fte.cli_scene_input import SceneOptions, positive, rig_choice, triangulated
-from acino_fte.errors import InputError
 
 
 class _Origin(StrEnum):
@@ -208,7 +215,7 @@ def scene(
     """
     with reported_errors(), _uncollected(), ExitStack() as stack:
         target = _target(folder, out)
-        kinds = _formats(formats)
+        kinds = chosen_formats(formats, _known_formats())
         given = SceneOptions(
             tracks=tracks,
             model=model,
@@ -233,8 +240,8 @@ def scene(
             from acino_fte.data_tools.scene_drawing import FigureProcess
 
             artist = stack.enter_context(FigureProcess())  # imports matplotlib while the scene is read
-        clock = _Clock()
-        show = stack.enter_context(_spinner(quiet))
+        clock = Clock()
+        show = stack.enter_context(spinner(quiet))
 
         def tell(step: str) -> None:
             clock.begin(step)
@@ -301,16 +308,7 @@ def _target(folder: Path, out: Path | None) -> Path:
     return check_output_folder(out, input_folder=folder if folder.exists() else None, contents=SCENE)
 
 
-def _formats(text: str) -> tuple[str, ...]:
+def _known_formats() -> tuple[str, ...]:
     from acino_fte.data_tools.scene_files import FORMATS
 
-    names = [name.strip().lower() for name in text.split(",") if name.strip()]
-    wrong = [name for name in names if name not in (*FORMATS, "csv")]
-    if wrong:
-        raise InputError(
-            "This format is not known.",
-            key="--format",
-            expected=f"some of csv, {', '.join(FORMATS)}, with commas between them",
-            found=", ".join(wrong),
-        )
-    return tuple(name for name in FORMATS if name in names)
+    return FORMATS
