@@ -30,6 +30,7 @@ NOISE_FLOOR = 0.02
 """Standard deviation of a dot, px; no detector is better."""
 _BINS, _FEWEST = 10, 20  # groups of points with like errors from poses, and points in one
 _OWN = np.geomspace(0.01, 25.0, 241)  # κ; poses off by more than five times what is said are no poses
+_LEVEL = 0.4  # relative error of how much more poses err in long gaps than elsewhere
 _BROAD_OWN, _BROAD_PX = 0.5, 0.35  # standard deviations of log κ and log σ before any residual
 _MODEL = 0.1  # relative error of a group's level
 
@@ -182,12 +183,14 @@ def _in_groups(from_poses: np.ndarray, ratio: np.ndarray) -> tuple[np.ndarray, n
 def _best_line(
     level: np.ndarray, typical: np.ndarray, relative: np.ndarray, px: float | None, usual_px: float
 ) -> tuple[float, float]:
-    """σ² and κ of typical = σ² + κ level, with relative errors of the typical values (G,)."""
+    """σ² and κ of typical = σ² + κ level, with relative errors of the typical values (G,).
+
+    The errors are relative to what is expected: found values that are small by chance are not surer.
+    """
     expected = np.full(len(level), max(float(np.mean(typical)), NOISE_FLOOR**2))
-    for _ in range(
-        3
-    ):  # the errors are relative to what is expected: found values that are small are not surer
-        weight = 1.0 / (relative * expected)
+    beside, best = np.abs(level - np.median(level)), int(np.argmin(np.abs(np.log(_OWN))))
+    for _ in range(4):
+        weight = 1.0 / np.hypot(relative * expected, _LEVEL * _OWN[best] * beside)
         rest = typical - _OWN[:, None] * level  # what is left for σ², (κ, G)
         variance = np.maximum((rest * weight**2).sum(1) / (weight**2).sum(), NOISE_FLOOR**2)
         if px is not None:
