@@ -28,12 +28,14 @@ from acino_fte.result_files import FILES
 REPOSITORY = Path(__file__).resolve().parent.parent
 EXAMPLE = REPOSITORY / "examples" / "cheetah_gallop"
 BIRDS = REPOSITORY / "examples" / "bird_tracks"
+WAND = REPOSITORY / "examples" / "wand_rig"
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
 SET_UP = [
     "pip install . && python scripts/run_fte.py examples/cheetah_gallop",
     'pip install ".[test]" && pytest',
 ]
-_NOT_HERE = {"new_species.md", "match_tracks.md"}
+_NOT_HERE = {"new_species.md", "match_tracks.md", "moving_cameras.md"}  # they have tests of their own
+_NO_FIGURES = ("acino-fte run ", "acino-fte match ", "acino-fte scene ")
 _KINDS = {"bash", "python", "yaml", "text"}
 _OTHERS = {"--check", "--help"}  # of ruff, of every command
 _NAMED = re.compile(r"# (?P<file>\S+\.yaml)\n")
@@ -46,7 +48,7 @@ def page_id(page: Path) -> str:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working folder with what the pages take to be there: the examples, and recordings of a user's own."""
-    for example in (EXAMPLE, BIRDS):
+    for example in (EXAMPLE, BIRDS, WAND):
         shutil.copytree(example, tmp_path / "examples" / example.name)
     make_acinoset(tmp_path / "2019_03_09")
     recording = tmp_path / "my_recording"
@@ -89,7 +91,7 @@ def follow(page: Path, folder: Path) -> None:
             for line in filter(str.strip, text.splitlines()):
                 if line == SET_UP[1]:
                     continue  # this is it
-                quick = " --no-figures" if line.startswith(("acino-fte run ", "acino-fte match ")) else ""
+                quick = " --no-figures" if line.startswith(_NO_FIGURES) else ""
                 execute(line.split("&&")[1] if line == SET_UP[0] else line + quick, folder)
         elif language == "python":
             exec(compile(text, f"{page.name}: {text.splitlines()[0]}", "exec"), names)
