@@ -1,4 +1,4 @@
-"""docs/moving_cameras.md does what it says: commands, Python and the numbers that it shows, from top to bottom.
+"""docs/moving_cameras.md does what it says: commands, Python and numbers, from top to bottom.
 
 Figures of the command are left out, to save time: test_scene_cli draws them. What the page and
 docs/scene_formats.md list (files, columns, keys, options, messages) is held against the program.
