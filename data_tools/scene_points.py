@@ -72,7 +72,7 @@ def triangulate_points(rows: SceneRows, views: Views, noise_px: float | None = N
     """
     used = np.bincount(rows.point, minlength=rows.n_points)[rows.point] >= 2
     position = refine(rows, nearest_points(rows, used), used)
-    total = _typical(rows, position, used)
+    total = max(_typical(rows, position, used), (noise_px or 0.0) ** 2)
     used, position = _consensus(rows, position, used, total)
     information = PointInformation(rows, views, position, used)
     noise = information.estimate_noise(noise_px)
@@ -185,13 +185,24 @@ def _consensus(
         right[block] = _vote(some, block, variance)
     right &= np.bincount(some.point[right], minlength=some.n_points)[some.point] >= 2
     found = refine(some, nearest_points(some, right), right)
-    misfit, freedom = _misfit(some, found, right)
-    with np.errstate(invalid="ignore"):
-        found[~(misfit <= variance * _limit(freedom))] = np.nan
+    found[~_agreed(some, found, right, variance)] = np.nan
     position, used = position.copy(), used.copy()
     position[doubtful] = found
     used[dots] = right & np.isfinite(found[some.point, 0])
     return used, position
+
+
+def _agreed(rows: SceneRows, position: np.ndarray, used: np.ndarray, variance: float) -> np.ndarray:
+    """Points (T,) that each of their dots is near; two views alone have to meet.
+
+    A point that all views see somewhat worse than others is still a point.
+    """
+    misfit, freedom = _misfit(rows, position, used)
+    residual, _ = rows.measured.linearise(position)
+    far = used & ~((residual**2).sum(1) < _GATE * variance)
+    near = np.bincount(rows.point[far], minlength=rows.n_points) == 0
+    with np.errstate(invalid="ignore"):
+        return np.where(freedom > 1, near, misfit <= variance * _limit(freedom)) & np.isfinite(misfit)
 
 
 def _vote(rows: SceneRows, block: np.ndarray, variance: float) -> np.ndarray:

@@ -220,6 +220,33 @@ def test_a_contradiction_of_two_views_is_given_up():
     assert np.isfinite(fit.position[~bad]).mean() > 0.99
 
 
+def test_points_seen_worse_than_others_are_still_points():
+    """One individual in ten, four times as noisy: no dot of it stands out."""
+    views, positions, tracks = world(6, n_frames=100, n=10)
+    rng = np.random.default_rng(5)
+    worse = [
+        replace(view, xy=view.xy + (view.track == 0)[:, None] * 4.0 * rng.normal(size=view.xy.shape))
+        for view in tracks
+    ]
+    rows, fit = solve(views, positions, worse)
+    mine = rows.individual == 0
+    assert np.isfinite(fit.position[mine]).all(1).mean() > 0.95 and np.isfinite(fit.position[~mine]).all()
+    error = fit.position - truth(rows, positions)
+    assert rms(error[mine & np.isfinite(error[:, 0])]) < 8 * rms(error[~mine])
+
+
+def test_a_noise_that_is_given_decides_what_is_wrong():
+    """Ten pixels off is wrong where dots have a pixel of noise, not where they are said to have five."""
+    views, positions, tracks = world(4, n_frames=100)
+    off = np.where(np.arange(len(tracks[0])) % 5 == 0, 10.0, 0.0)[:, None] * np.array([0.6, 0.8])
+    moved = [replace(tracks[0], xy=tracks[0].xy + off), *tracks[1:]]
+    rows, strict = solve(views, positions, moved)
+    _, lenient = solve(views, positions, moved, 5.0)
+    hit = (rows.camera == 0) & (rows.place % 5 == 0)
+    assert strict.used[hit].mean() < 0.05 and lenient.used.all()
+    assert strict.used[~hit].mean() > 0.99 and lenient.noise.px == 5.0
+
+
 def test_a_wrong_view_of_three_may_be_any():
     views, positions, tracks = world(3, n_frames=40, noise=0.5)
     for c in range(3):
