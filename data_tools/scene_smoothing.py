@@ -25,6 +25,7 @@ from acino_fte.data_tools.trajectory_rows import ViewRows
 
 _AROUND, _FIRM = 15, 1e-9  # frames on both sides that count as neighbours; keeps their sum invertible
 _JUMP, _JUMP_ROUNDS, _NEIGHBOURS = 8.0, 3, 8  # medians; rounds; frames from the dot before to that after
+_DEEPEST = 0.1  # of its distance, how uncertain a point may be that less than two views see
 _BRIDGE = 10  # a path goes on across gaps of so many times the longest gap that is filled
 
 
@@ -68,7 +69,8 @@ def smooth_points(rows: SceneRows, views: Views, fit: PointFit, max_gap: int) ->
     Returns
     -------
     PathPoints
-        Individuals that no two views ever see have none.
+        Individuals that no two views ever see have none, nor has what one view alone sees for so long that
+        its depth is anyone's guess.
     """
     decided = np.bincount(rows.point[fit.used], minlength=rows.n_points)[rows.point] > 0
     chosen = np.flatnonzero(fit.used | ~decided)
@@ -84,6 +86,7 @@ def smooth_points(rows: SceneRows, views: Views, fit: PointFit, max_gap: int) ->
         max_gap=_BRIDGE * max_gap,
         first_frame=views.first_frame,
         sudden=False,
+        alike=False,
     )
     used = np.zeros(len(rows.point), dtype=bool)
     for k, wrong, distance in zip(parts, paths.wrong, paths.distance, strict=True):
@@ -91,7 +94,7 @@ def smooth_points(rows: SceneRows, views: Views, fit: PointFit, max_gap: int) ->
     node = paths.find(rows.individual, rows.frame)[rows.point]
     used &= node >= 0
     covariance = _with_poses(rows, views, fit.noise, paths, node, used, variance)
-    keep = ~_too_long(paths, max_gap)
+    keep = ~_too_long(paths, max_gap) & ~_unknown_depth(paths, covariance, views)
     return PathPoints(
         paths.group[keep], paths.frame[keep], paths.position[keep], covariance[keep], paths.source[keep], used
     )
@@ -197,6 +200,19 @@ def _moving_mean(values: np.ndarray, piece: np.ndarray) -> np.ndarray:
     end = np.searchsorted(piece, piece, side="right")
     low, high = np.maximum(index - _AROUND, begin), np.minimum(index + _AROUND + 1, end)
     return (total[high] - total[low]) / (high - low)[:, None, None]
+
+
+def _unknown_depth(paths: Trajectories, covariance: np.ndarray, views: Views) -> np.ndarray:
+    """Nodes (T,) that less than two views see, of which too little of the depth is known."""
+    few = np.flatnonzero(paths.source > 0)
+    row = paths.frame[few] - views.first_frame
+    near = np.full(len(few), np.inf)
+    for camera, known in zip(views.cameras, views.known, strict=True):
+        distance = np.linalg.norm(paths.position[few] - camera.centre[row], axis=1)
+        near = np.where(known[row], np.minimum(near, distance), near)
+    out = np.zeros(len(paths), dtype=bool)
+    out[few] = np.sqrt(np.linalg.eigvalsh(covariance[few])[:, 2]) > _DEEPEST * near
+    return out
 
 
 def _too_long(paths: Trajectories, max_gap: int) -> np.ndarray:

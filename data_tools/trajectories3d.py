@@ -140,6 +140,7 @@ def smooth_trajectories(
     extend: int = 0,
     first_frame: int = 0,
     sudden: bool = True,
+    alike: bool = True,
 ) -> Trajectories:
     """The most probable 3D path of every group.
 
@@ -164,6 +165,8 @@ def smooth_trajectories(
     sudden : bool
         Whether many wrong rows at once may be a sudden movement, which heavier tails of the innovations can
         explain. Where wrong rows are known to come in crowds, False is faster and safer.
+    alike : bool
+        Whether all animals are equally agile, or the steps of each are estimated.
 
     Returns
     -------
@@ -186,7 +189,8 @@ def smooth_trajectories(
     nodes, kept_nodes = take_pieces(nodes, _any(np.isfinite(points[:, 0]), nodes.pieces))
     kept = np.flatnonzero(kept_nodes[rows.node])
     rows = rows.subset(kept, (np.cumsum(kept_nodes) - 1)[rows.node[kept]])
-    fit = fit_paths(rows, nodes.pieces, points[kept_nodes], motion, gate, sudden)
+    owner = None if alike else nodes.group[nodes.pieces.start]
+    fit = fit_paths(rows, nodes.pieces, points[kept_nodes], motion, gate, sudden, owner)
     return _collect(fit, rows, nodes, views, place[kept], first_frame)
 
 

@@ -6,13 +6,21 @@ Shapes: T nodes.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
-from acino_fte.data_tools.trajectory_motion import N_LAGS, MotionModel, Pieces, innovations, log_information
+from acino_fte.data_tools.trajectory_motion import (
+    N_LAGS,
+    MotionModel,
+    Pieces,
+    innovation_variances,
+    innovations,
+    log_information,
+)
 from acino_fte.data_tools.trajectory_smoother import ChainFactor
 
 _WINDOW, _SAMPLE = 50, 1500  # frames in a window, nodes to estimate the prior from
 _BROAD = np.array([2.0, 1.5, 1.5])  # standard deviations of log q and atanh r before any data
+_BROAD_AGILITY, _MOST_AGILE = 0.7, 2.5  # of the logarithm: standard deviation before any data, and bound
 _FEW = 10  # frames below which the moments say nothing
 _FLAT = 0.005  # gradient at which the search ends, about the error of log q
 _REACH = 3.5  # largest inverse hyperbolic tangent of a partial autocorrelation
@@ -64,6 +72,58 @@ def estimate_motion(
     return _motion(found.x, scale)
 
 
+def estimate_agility(
+    x: np.ndarray,
+    information: np.ndarray,
+    gradient: np.ndarray,
+    pieces: Pieces,
+    motion: MotionModel,
+    group: np.ndarray,
+) -> dict[int, float]:
+    """How agile each group of pieces is against the prior of all: of greatest marginal likelihood.
+
+    A broad law of its logarithm around 0 decides for groups with few frames.
+
+    Parameters
+    ----------
+    x, information, gradient, pieces
+        As for :func:`estimate_motion`.
+    motion : MotionModel
+        Of all together.
+    group : (S,) int
+        The animal of each piece.
+    """
+    x = x - np.repeat(x[pieces.start], pieces.length, axis=0)
+    return {
+        int(one): _agility(x, information, gradient, pieces, motion, group == one) for one in np.unique(group)
+    }
+
+
+def _agility(
+    x: np.ndarray,
+    information: np.ndarray,
+    gradient: np.ndarray,
+    pieces: Pieces,
+    motion: MotionModel,
+    mine: np.ndarray,
+) -> float:
+    """Of the pieces (S,) bool."""
+    nodes, length = mine[pieces.owner], pieces.length[mine]
+    x, information, gradient = x[nodes], information[nodes], gradient[nodes]
+
+    def value(log_agility: float) -> float:
+        agile = Pieces(length, np.full(len(length), np.exp(log_agility)))
+        try:
+            evidence = log_evidence(x, information, gradient, agile, motion)
+        except np.linalg.LinAlgError:
+            return np.inf
+        return 0.5 * (log_agility / _BROAD_AGILITY) ** 2 - evidence
+
+    bounds = (-_MOST_AGILE, _MOST_AGILE)
+    found = minimize_scalar(value, bounds=bounds, method="bounded", options={"xatol": 0.02})
+    return float(np.exp(found.x))
+
+
 def log_evidence(
     x: np.ndarray, information: np.ndarray, gradient: np.ndarray, pieces: Pieces, motion: MotionModel
 ) -> float:
@@ -72,7 +132,7 @@ def log_evidence(
     step = factor.solve(gradient - factor.prior_times(x))
     cost = np.einsum("ni,nij,nj->", step, information, step) - 2 * np.vdot(gradient, step)
     new = innovations(motion, pieces, x + step)  # xᵀP x itself would drown in rounding errors
-    cost += ((new**2).sum(1) / motion.variances[pieces.age]).sum()
+    cost += ((new**2).sum(1) / innovation_variances(motion, pieces)).sum()
     return -0.5 * (float(cost) + factor.log_determinant) + 1.5 * log_information(motion, pieces)
 
 
@@ -93,7 +153,8 @@ def sample_windows(pieces: Pieces, known: np.ndarray) -> tuple[np.ndarray, Piece
     order = np.random.default_rng(0).permutation(len(length))
     chosen = np.sort(order[: np.searchsorted(np.cumsum(length[order]), _SAMPLE) + 1])
     nodes = np.repeat(begin[chosen], length[chosen]) + _count_up(length[chosen])
-    return nodes, Pieces(length[chosen])
+    agility = None if pieces.agility is None else pieces.agility[pieces.owner[begin[chosen]]]
+    return nodes, Pieces(length[chosen], agility)
 
 
 def _count_up(counts: np.ndarray) -> np.ndarray:

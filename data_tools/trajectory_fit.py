@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from acino_fte.data_tools.trajectory_estimate import estimate_motion, sample_windows
+from acino_fte.data_tools.trajectory_depth import LoneRows
+from acino_fte.data_tools.trajectory_estimate import estimate_agility, estimate_motion, sample_windows
 from acino_fte.data_tools.trajectory_motion import (
     MotionModel,
     Pieces,
+    innovation_variances,
     innovations,
     tail_weights,
 )
@@ -69,6 +71,7 @@ def fit_paths(
     motion: MotionModel | None,
     gate: float,
     sudden: bool = True,
+    group: np.ndarray | None = None,
 ) -> PathFit:
     """Fit all paths; wrong rows leave, and rows that belong after all come back.
 
@@ -86,8 +89,12 @@ def fit_paths(
         Distance beyond which a row is wrong.
     sudden : bool
         Whether a crowd of wrong rows may be a sudden movement.
+    group : (S,) int, optional
+        The animal of each piece, where each may be as agile as it is.
     """
-    prior = motion or _estimated(rows, pieces, points, gate, sudden)
+    prior = motion
+    if prior is None:
+        prior, pieces = _estimated(rows, pieces, points, gate, sudden, group)
     n = pieces.n_nodes
     x, covariance = np.empty((n, 3)), np.empty((n, 3, 3))
     used, distance, residual = np.empty(len(rows), dtype=bool), np.empty(len(rows)), np.empty((len(rows), 2))
@@ -97,7 +104,7 @@ def fit_paths(
         at = slice(pieces.start[mine][0], pieces.start[mine][-1] + pieces.length[mine][-1])
         chosen = np.flatnonzero((rows.node >= at.start) & (rows.node < at.stop))
         part = rows.subset(chosen, rows.node[chosen] - at.start)
-        fit = _settled(part, Pieces(pieces.length[mine]), points[at], prior, gate, sudden)
+        fit = _settled(part, pieces.take(mine), points[at], prior, gate, sudden)
         x[at], covariance[at] = fit.x, fit.covariance
         used[chosen], distance[chosen], residual[chosen] = fit.used, fit.distance, fit.residual
     return PathFit(x, covariance, used, distance, residual, prior)
@@ -179,11 +186,19 @@ def _crowded(node: np.ndarray, pieces: Pieces) -> np.ndarray:
 
 
 def _estimated(
-    rows: Measurements, pieces: Pieces, points: np.ndarray, gate: float, sudden: bool
-) -> MotionModel:
-    """The prior from windows spread over all pieces; again after wrong rows have left."""
+    rows: Measurements,
+    pieces: Pieces,
+    points: np.ndarray,
+    gate: float,
+    sudden: bool,
+    group: np.ndarray | None,
+) -> tuple[MotionModel, Pieces]:
+    """The prior from windows spread over all pieces; again after wrong rows have left.
+
+    Also the pieces with how agile their animals are, where these are told apart.
+    """
     if not pieces.n_nodes:
-        return MotionModel(1.0)
+        return MotionModel(1.0), pieces
     nodes, windows = sample_windows(pieces, np.isfinite(points[:, 0]))
     place = np.full(pieces.n_nodes, -1)
     place[nodes] = np.arange(len(nodes))
@@ -200,7 +215,12 @@ def _estimated(
         used, x = fit.used, fit.x
         at_path = rows.information(*rows.linearise(x), used, len(x))
         motion = estimate_motion(x, *at_path, windows, motion)
-    return motion
+    if group is None or len(np.unique(group)) == 1:
+        return motion, pieces
+    at_path = rows.information(*rows.linearise(x), used, len(x))
+    owner = group[pieces.owner[nodes[windows.start]]]
+    found = estimate_agility(x, *at_path, windows, motion, owner)
+    return motion, Pieces(pieces.length, np.array([found.get(int(one), 1.0) for one in group]))
 
 
 def _doubtful(rows: Measurements, residual: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -254,7 +274,7 @@ def _refit(
     at_node, at_row = changed[pieces.owner], changed[pieces.owner[rows.node]]
     chosen = np.flatnonzero(at_row)
     new_node = np.cumsum(at_node) - 1
-    mine, its = rows.subset(chosen, new_node[rows.node[chosen]]), Pieces(pieces.length[changed])
+    mine, its = rows.subset(chosen, new_node[rows.node[chosen]]), pieces.take(changed)
     views = np.bincount(mine.node[used[chosen]], minlength=its.n_nodes)
     begin = starting_path(mine, its, np.where(views[:, None] >= 2, fit.x[at_node], np.nan), used[chosen])
     part = _fit(mine, its, begin, used[chosen], motion)
@@ -329,7 +349,8 @@ def improve(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Gauss–Newton steps to the most probable paths.
 
-    With heavy tails every step also renews the weights of the innovations (expectation–maximisation).
+    Single views push their paths away (:mod:`trajectory_depth`). With heavy tails every step also renews the
+    weights of the innovations (expectation–maximisation).
     Returns the paths (T, 3), their covariances (T, 3, 3), the residuals (P, 2) and the derivatives (P, 2, 3)
     of the predictions.
 
@@ -350,11 +371,13 @@ def improve(
     """
     sigma = np.sqrt(measurements.variance)
     heavy, weight = np.isfinite(motion.tails), None
+    lone = LoneRows(measurements, used, pieces, motion)
     before, length = None, np.ones(len(pieces.length))
     for number in range(_MAX_STEPS):
         residual, slope = linear or measurements.linearise(x)
         linear = None
         cost = _cost(measurements, residual, used, x, pieces, motion)
+        cost += np.bincount(pieces.owner[lone.node], lone.cost(slope), len(pieces.length))
         if before is not None and not heavy:
             worse = ~(cost <= before[0] + _WORSE * (1.0 + np.abs(before[0]))) & (length > _SHORTEST)
             if worse.any():  # a shorter step for these paths
@@ -364,6 +387,7 @@ def improve(
                 )
                 continue
         information, gradient = measurements.information(residual, slope, used, len(x))
+        lone.push(x, slope, information, gradient)
         factor = ChainFactor(information, motion, pieces, weight)
         downhill = gradient - factor.prior_times(x)
         step = factor.solve(downhill)
@@ -396,7 +420,7 @@ def _cost(
     rows = np.bincount(
         pieces.owner[measurements.node], np.nan_to_num(squared, nan=_BEHIND), len(pieces.length)
     )
-    new = (innovations(motion, pieces, x) ** 2).sum(1) / motion.variances[pieces.age]
+    new = (innovations(motion, pieces, x) ** 2).sum(1) / innovation_variances(motion, pieces)
     return rows + np.bincount(pieces.owner, np.where(pieces.age > 0, new, 0.0), len(pieces.length))
 
 

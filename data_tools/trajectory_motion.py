@@ -73,9 +73,16 @@ class Pieces:
     ----------
     length : (S,) int
         Frames of each piece.
+    agility : (S,), optional
+        How many times the prior's step the animal of each piece takes; by default all move alike.
     """
 
     length: np.ndarray
+    agility: np.ndarray | None = None
+
+    def take(self, chosen: np.ndarray) -> Pieces:
+        """Some of the pieces, as a mask or an index (S,)."""
+        return Pieces(self.length[chosen], None if self.agility is None else self.agility[chosen])
 
     @cached_property
     def start(self) -> np.ndarray:
@@ -98,6 +105,14 @@ class Pieces:
         return np.minimum(np.arange(self.n_nodes) - self.start[self.owner], N_LAGS)
 
 
+def innovation_variances(motion: MotionModel, pieces: Pieces) -> np.ndarray:
+    """Variance of each node's innovation (T,), m²; that of a piece's first frame is free."""
+    variance = motion.variances[pieces.age]
+    if pieces.agility is None:
+        return variance
+    return np.where(pieces.age > 0, pieces.agility[pieces.owner] ** 2, 1.0) * variance
+
+
 def prior_band(motion: MotionModel, pieces: Pieces, weight: np.ndarray | None = None) -> np.ndarray:
     """The prior's information between frames t + l and t of one axis, (4, T): lag l in row l, column t.
 
@@ -111,7 +126,7 @@ def prior_band(motion: MotionModel, pieces: Pieces, weight: np.ndarray | None = 
         Factor on the information of each innovation.
     """
     age, n = pieces.age, pieces.n_nodes
-    information = 1.0 / motion.variances[age]
+    information = 1.0 / innovation_variances(motion, pieces)
     if weight is not None:
         information = information * weight
     c = motion.coefficients[age]  # (T, 4)
@@ -142,11 +157,10 @@ def tail_weights(motion: MotionModel, pieces: Pieces, squared: np.ndarray) -> np
     """
     if not np.isfinite(motion.tails):
         return np.ones(len(squared))
-    weight = (motion.tails + 3.0) / (motion.tails + squared / motion.variances[pieces.age])
+    weight = (motion.tails + 3.0) / (motion.tails + squared / innovation_variances(motion, pieces))
     return np.where(pieces.age == N_LAGS, weight, np.where(pieces.age == 0, 1.0, np.minimum(weight, 1.0)))
 
 
 def log_information(motion: MotionModel, pieces: Pieces) -> float:
     """log det of the prior's information about one axis."""
-    counts = np.bincount(pieces.age, minlength=N_LAGS + 1)
-    return -float(counts @ np.log(motion.variances))
+    return -float(np.log(innovation_variances(motion, pieces)).sum())

@@ -86,7 +86,7 @@ def make_nodes(group: np.ndarray, frame: np.ndarray, max_gap: int, extend: int) 
 def take_pieces(nodes: Nodes, chosen: np.ndarray) -> tuple[Nodes, np.ndarray]:
     """Some of the pieces, given as (S,) bool, and which nodes these are, (T,) bool."""
     kept = np.repeat(chosen, nodes.pieces.length)
-    return Nodes(Pieces(nodes.pieces.length[chosen]), nodes.group[kept], nodes.frame[kept]), kept
+    return Nodes(nodes.pieces.take(chosen), nodes.group[kept], nodes.frame[kept]), kept
 
 
 class Measurements:
@@ -152,6 +152,13 @@ class Measurements:
             origin[at] = camera.centre
             direction[at] = camera.rays(self.xy[at][:, None])[:, 0]
         return origin, direction
+
+    def centres(self) -> np.ndarray:
+        """Where the camera of each row is, (P, 3)."""
+        out = np.empty((len(self.node), 3))
+        for at, camera in self._parts:
+            out[at] = camera.centre
+        return out
 
     def linearise(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (P, 2), measured less predicted, and derivatives of the predictions (P, 2, 3)."""

@@ -12,7 +12,7 @@ from test_run_cli import ENVIRONMENT, refused, snapshot, start, words
 from typer.testing import CliRunner
 
 from acino_fte.cli import app
-from acino_fte.cli_match import _Clock
+from acino_fte.cli_common import Clock
 from acino_fte.data_tools.match_files import MATCHING
 from acino_fte.data_tools.simulate_tracks import TrackSimulation, simulate_tracks
 from acino_fte.data_tools.track_folder import write_tracks
@@ -180,8 +180,8 @@ def test_nothing_to_match_is_said(mine, here):
 
 def test_time_of_steps_adds_up(monkeypatch):
     now = iter([0.0, 1.0, 1.0, 3.0, 3.0, 7.0])
-    monkeypatch.setattr("acino_fte.cli_match.time.perf_counter", lambda: next(now))
-    clock = _Clock()
+    monkeypatch.setattr("acino_fte.cli_common.time.perf_counter", lambda: next(now))
+    clock = Clock()
     for step in ("noise", "matching", "noise"):
         clock.begin(step)
     clock.end()
