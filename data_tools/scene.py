@@ -9,7 +9,7 @@ Nothing is changed in place: every method gives a new scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +21,14 @@ from acino_fte.data_tools.colmap import ColmapModel, read_colmap
 from acino_fte.data_tools.colmap_covariance import PoseErrors, mended, pose_errors
 from acino_fte.data_tools.colmap_images import keyed_cameras, parse_image_names
 from acino_fte.data_tools.point_cloud import PointCloud
+from acino_fte.data_tools.scene_noise import NOISE_FLOOR
+from acino_fte.data_tools.scene_notes import (
+    after_all_moving,
+    misfits,
+    needed_keys,
+    unseen_individuals,
+    unused_dots,
+)
 from acino_fte.data_tools.scene_paths import RigChoice, ScenePaths, scene_paths
 from acino_fte.data_tools.scene_points import retriangulate, triangulate_points
 from acino_fte.data_tools.scene_record import scene_record
@@ -30,7 +38,7 @@ from acino_fte.data_tools.scene_result import (
     smooth_tracks,
     with_single_views,
 )
-from acino_fte.data_tools.scene_rows import SceneRows, scene_rows
+from acino_fte.data_tools.scene_rows import scene_rows
 from acino_fte.data_tools.scene_smoothing import smooth_points
 from acino_fte.data_tools.similarity import Similarity
 from acino_fte.data_tools.tracks import PixelOrigin, read_scene_tracks
@@ -225,7 +233,7 @@ class Scene:
         """
         from acino_fte.data_tools.time_offsets import (
             estimate_time_offsets,
-            keys_on_reference_clock,
+            keys_on_one_clock,
             tracks_on_reference_clock,
         )
 
@@ -239,7 +247,7 @@ class Scene:
         ]
         return replace(
             self,
-            cameras=tuple(keys_on_reference_clock(c, *s) for c, s in zip(self.cameras, shifts, strict=True)),
+            cameras=keys_on_one_clock(self.cameras, paths, shifts),
             tracks=tuple(tracks_on_reference_clock(t, *s) for t, s in zip(self.tracks, shifts, strict=True)),
             clocks=clocks,
             warnings=(*self.warnings, *clocks.notes),
@@ -282,12 +290,21 @@ class Scene:
             points = self.triangulate(smooth=False).points
         return scene_scale([(one, measure_distance(one, self.cameras, points)) for one in known])
 
-    def camera_paths(self, rig: RigChoice = "auto", max_pose_gap: float | None = None) -> ScenePaths:
+    def camera_paths(
+        self,
+        rig: RigChoice = "auto",
+        max_pose_gap: float | None = None,
+        not_standing: Collection[str] = (),
+    ) -> ScenePaths:
         """The paths of all cameras (:func:`scene_paths.scene_paths`)."""
-        seen = [view.frame for view in self.tracks if len(view)]
-        frames = (min(map(np.min, seen)), max(map(np.max, seen)) + 1) if seen else None
+        cameras, frames = needed_keys(self.cameras, self.tracks)
         return scene_paths(
-            self.cameras, rig=rig, declared=self.declared_rigs, max_gap=max_pose_gap, frames=frames
+            cameras,
+            rig=rig,
+            declared=self.declared_rigs,
+            max_gap=max_pose_gap,
+            frames=frames,
+            not_standing=not_standing,
         )
 
     def triangulate(
@@ -321,47 +338,49 @@ class Scene:
         Raises
         ------
         InputError
-            A rig cannot be made.
+            A rig cannot be made, or the noise is impossible.
         """
         tell = tell or (lambda step: None)
+        if noise_px is not None and not NOISE_FLOOR <= noise_px < np.inf:
+            raise InputError(
+                "The noise of the dots is impossible.",
+                key="noise_px",
+                expected=f"{NOISE_FLOOR:g} px or more",
+                found=f"{noise_px:g}",
+            )
         tell("camera paths")
         paths = self.camera_paths(rig, max_pose_gap)
         tell("triangulation")
         names = self.individuals
         rows = scene_rows(paths.views, self.tracks, names)
         fit = triangulate_points(rows, paths.views, noise_px)
+        moved = after_all_moving(self.cameras, rows, fit)
+        if moved:
+            paths = self.camera_paths(rig, max_pose_gap, moved)
+            rows = scene_rows(paths.views, self.tracks, names)
+            fit = triangulate_points(rows, paths.views, noise_px)
         tracks = points = single_frames(rows, fit, self.tracks, names)
+        notes = [*paths.notes, *unused_dots(rows, paths.views, self.tracks), *misfits(rows, fit)]
         if len(points):
             tell("smoothing")
             gap = max_gap if max_gap is not None else round(_GAP_S * self.fps) if self.fps else _GAP
-            smoothed = smooth_points(rows, paths.views, fit, gap)
-            fit = retriangulate(rows, paths.views, fit, smoothed.used)
-            points = single_frames(rows, fit, self.tracks, names)
-            tracks = smooth_tracks(rows, smoothed, self.tracks, names)
-            if not smooth:
-                tracks = with_single_views(points, tracks)
-        notes = (*paths.notes, *self._unseen(rows, tracks.individual))
+            try:
+                smoothed = smooth_points(rows, paths.views, fit, gap)
+            except np.linalg.LinAlgError:
+                notes.append("The paths cannot be smoothed: points are triangulated frame by frame.")
+            else:
+                fit = retriangulate(rows, paths.views, fit, smoothed.used)
+                points = single_frames(rows, fit, self.tracks, names)
+                tracks = smooth_tracks(rows, smoothed, self.tracks, names)
+                if not smooth:
+                    tracks = with_single_views(points, tracks)
+        notes += unseen_individuals(names, tracks.individual)
         numbers = {
             **scene_record(self, paths),
             "pose_noise_share": {"own": fit.noise.own, "common": fit.noise.common},
             "warnings": notes,
         }
         return SceneResult(self, tracks, points, paths.paths, paths.rigs, fit.noise.px, numbers)
-
-    def _unseen(self, rows: SceneRows, found: np.ndarray) -> list[str]:
-        """Notes on dots and individuals that came to nothing."""
-        notes = []
-        without = sum(len(view) for view in self.tracks) - len(rows.point)
-        if without:
-            notes.append(
-                f"{without} dots have no pose of their camera (before, after or far from its key frames), "
-                "no individual, or lie outside of the lens's valid field; they are not used."
-            )
-        missing = [name for i, name in enumerate(self.individuals) if i not in set(found.tolist())]
-        if missing:
-            listed = ", ".join(missing[:10]) + (", …" if len(missing) > 10 else "")
-            notes.append(f"No two views see these individuals at one time: {listed}. They have no 3D track.")
-        return notes
 
 
 def _declared(model: ColmapModel, names: Sequence[str]) -> tuple[tuple[str, ...], ...]:

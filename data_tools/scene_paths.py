@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,11 @@ from acino_fte.errors import InputError
 
 RigChoice = str | Sequence[Sequence[str]]
 _TURN_PX, _DISTANCE = 1.0, 100.0  # of poses that nothing is known of: pixels, and shift as a part of distance
+_STANDS = "Camera '{}' has one image with a pose: it is taken to stand still."
+_MOVES = (
+    "Camera '{}' has one image with a pose, and its dots show that it moved: it counts in that frame only. "
+    "Register more of its images."
+)
 _LONG_DRIFT = 3.0  # a sensor's drift in standard deviations of an image's pose that is worth a word
 
 
@@ -49,6 +54,7 @@ def scene_paths(
     declared: Sequence[tuple[str, ...]] = (),
     max_gap: float | None = None,
     frames: tuple[int, int] | None = None,
+    not_standing: Collection[str] = (),
 ) -> ScenePaths:
     """The paths of all cameras.
 
@@ -64,6 +70,8 @@ def scene_paths(
         Frames between key frames beyond which nothing is invented.
     frames : (first, last + 1), optional
         Of cameras that stand still, known from one image.
+    not_standing : collection of str
+        Cameras with one image that do move: their pose is known in that frame only.
 
     Raises
     ------
@@ -89,15 +97,19 @@ def scene_paths(
             paths[name], noise[name] = fused.sensor_path(middle, name), fused.noise
             base[name] = len(bases)
         bases.append(middle)
+    extent = _extent(cameras)
     for camera in cameras:
         if camera.name in paths:
             continue
-        noise[camera.name] = pose_noise(camera)
-        paths[camera.name] = camera_path(camera, noise[camera.name], max_gap=max_gap, frames=frames)
+        noise[camera.name] = pose_noise(camera, extent)
+        stands = camera.name not in not_standing
+        paths[camera.name] = camera_path(
+            camera, noise[camera.name], max_gap=max_gap, frames=frames if stands else None
+        )
         base[camera.name] = len(bases)
         bases.append(paths[camera.name])
         if len(camera.frame) == 1:
-            notes.append(f"Camera '{camera.name}' has one image with a pose: it is taken to stand still.")
+            notes.append(_STANDS.format(camera.name) if stands else _MOVES.format(camera.name))
     ordered = tuple(paths[camera.name] for camera in cameras)
     lenses = [camera.lens for camera in cameras]
     alone = [camera for camera in cameras if all(camera.name not in one.names for one in rigs)]
@@ -106,11 +118,25 @@ def scene_paths(
     return ScenePaths(ordered, tuple(rigs), views, noise, tuple(notes))
 
 
-def pose_noise(camera: KeyedCamera) -> PoseNoise:
+def _extent(cameras: Sequence[KeyedCamera]) -> float:
+    """How far the cameras are from each other, or move: root mean square from their middle."""
+    centres = np.concatenate([camera.centre for camera in cameras])
+    return float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+
+
+def pose_noise(camera: KeyedCamera, extent: float = 0.0) -> PoseNoise:
     """How far the key frames of a camera are off, from their covariances.
 
     One number for all key frames, the median: what observations in a single image say of its own pose is
-    itself noisy. Without covariances a pixel's angle, and a hundredth of the way between key frames.
+    itself noisy. Without covariances a pixel's angle, and a hundredth of the way between key frames, or of
+    the extent of all cameras.
+
+    Parameters
+    ----------
+    camera : KeyedCamera
+        With or without covariances.
+    extent : float
+        Of all cameras, for one that has a single key frame.
     """
     if camera.covariance is not None:
         known = np.isfinite(camera.covariance).all((1, 2))
@@ -124,7 +150,7 @@ def pose_noise(camera: KeyedCamera) -> PoseNoise:
             shape = to_camera @ covariance @ to_camera.transpose(0, 2, 1) / (unit[:, :, None] * unit[:, None])
             return PoseNoise(float(np.median(turn)), float(np.median(shift)), shape.mean(0))
     steps = np.linalg.norm(np.diff(camera.centre, axis=0), axis=1)
-    way = float(np.median(steps)) if len(steps) else float(np.linalg.norm(camera.translation[0]))
+    way = float(np.median(steps)) if len(steps) else extent
     return PoseNoise(_TURN_PX / camera.lens.matrix[0, 0], max(way / _DISTANCE, 1e-12))
 
 

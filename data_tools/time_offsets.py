@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -167,42 +167,54 @@ def _checked(
     return names
 
 
-def keys_on_reference_clock(
-    camera: KeyedCamera, offset: float, drift: float = 0.0, middle: float = 0.0
-) -> KeyedCamera:
-    """Key frames of a camera in whole frames of the reference's clock.
+def keys_on_one_clock(
+    cameras: Sequence[KeyedCamera],
+    paths: Sequence[CameraPath],
+    shifts: Sequence[tuple[float, float, float]],
+) -> tuple[KeyedCamera, ...]:
+    """Cameras with key frames that all have in common, on the reference's clock.
 
-    Each goes to the nearest whole frame; for the part of a frame that is left, its pose moves towards that of
-    the next key frame (or on from the one before it, at the ends). Of two that fall on one frame the first
-    stays.
+    Key frames of clocks that differ by parts of a frame never fall together, and rigs are told by common key
+    frames. So all paths are read off at the same frames, as far apart as the densest key frames.
 
     Parameters
     ----------
-    camera : KeyedCamera
-        On its own clock.
-    offset, drift, middle : float
-        As in :class:`TimeOffsets`.
+    cameras : sequence of KeyedCamera
+        On their own clocks.
+    paths : sequence of CameraPath
+        Of the same cameras, on their own clocks.
+    shifts : sequence of (offset, drift, middle)
+        As in :class:`TimeOffsets`, for each camera.
     """
-    time = camera.frame + offset + drift * (camera.frame - middle)
-    frame, keep = np.unique(np.round(time).astype(int), return_index=True)
-    if len(camera.frame) == 1:
-        return replace(camera, frame=frame)
-    rest = own_time(frame, offset, drift, middle) - camera.frame[keep]
-    last = len(camera.frame) - 1
-    towards = np.where(rest >= 0, keep + 1, keep - 1)
-    towards = np.where(towards > last, last - 1, np.where(towards < 0, 1, towards))
-    part = rest / (camera.frame[towards] - camera.frame[keep])
-    start, end = camera.rotation[keep], camera.rotation[towards]
-    step = Rotation.from_matrix(end @ np.swapaxes(start, 1, 2)).as_rotvec()
-    rotation = Rotation.from_rotvec(part[:, None] * step).as_matrix() @ start
-    centre = camera.centre[keep] + part[:, None] * (camera.centre[towards] - camera.centre[keep])
-    return replace(
-        camera,
-        frame=frame,
-        rotation=rotation,
-        translation=-np.einsum("kij,kj->ki", rotation, centre),
-        covariance=None if camera.covariance is None else camera.covariance[keep],
-    )
+    steps = [float(np.median(np.diff(camera.frame))) for camera in cameras if len(camera.frame) > 1]
+    step = max(1, round(min(steps))) if steps else 1
+    moved = []
+    for camera, path, shift in zip(cameras, paths, shifts, strict=True):
+        here = _path_at(path, *shift)
+        chosen = np.flatnonzero(here.known & (here.frame % step == 0))
+        if len(camera.frame) == 1 or not len(chosen):
+            frame = np.round(camera.frame + shift[0] + shift[1] * (camera.frame - shift[2])).astype(int)
+            moved.append(replace(camera, frame=frame[:1], **_first_key(camera)))
+            continue
+        moved.append(
+            replace(
+                camera,
+                frame=here.frame[chosen],
+                rotation=here.rotation[chosen],
+                translation=here.translation[chosen],
+                covariance=here.covariance[chosen],
+            )
+        )
+    return tuple(moved)
+
+
+def _first_key(camera: KeyedCamera) -> dict[str, Any]:
+    covariance = None if camera.covariance is None else camera.covariance[:1]
+    return {
+        "rotation": camera.rotation[:1],
+        "translation": camera.translation[:1],
+        "covariance": covariance,
+    }
 
 
 def to_reference_clock(

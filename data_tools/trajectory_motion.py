@@ -135,7 +135,7 @@ def prior_band(motion: MotionModel, pieces: Pieces, weight: np.ndarray | None = 
         for lag in range(N_LAGS + 1 - later):  # x_(t−later) with x_(t−later−lag)
             value = information * c[:, later] * c[:, later + lag]
             shift = later + lag
-            band[lag, : n - shift] += value[shift:]
+            band[lag, : max(n - shift, 0)] += value[shift:]
     band[0] += information * (age == 0)
     return band
 

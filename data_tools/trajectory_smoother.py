@@ -73,7 +73,7 @@ class ChainFactor:
     def prior_times(self, x: np.ndarray) -> np.ndarray:
         """P x of (T, 3)."""
         out = self._prior[0][:, None] * x
-        for lag in range(1, N_LAGS + 1):
+        for lag in range(1, min(N_LAGS, len(x) - 1) + 1):
             part = self._prior[lag, : len(x) - lag, None]
             out[lag:] += part * x[:-lag]
             out[:-lag] += part * x[lag:]

@@ -1,5 +1,7 @@
 """Clocks of cameras: found from moving individuals, with honest errors, or reported as not observable."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,7 +12,7 @@ from acino_fte.data_tools.camera_paths import CameraPath
 from acino_fte.data_tools.time_offsets import (
     TimeOffsets,
     estimate_time_offsets,
-    keys_on_reference_clock,
+    keys_on_one_clock,
     own_time,
     to_reference_clock,
 )
@@ -212,28 +214,34 @@ def test_dots_and_poses_on_the_reference_clock_are_those_of_that_time():
     np.testing.assert_array_equal(tracks.xy, xy[order])  # the input stays
 
 
-def test_key_frames_on_the_reference_clock_are_those_of_that_time():
-    offset, drift, middle = -12.4, 1e-3, 50.0
-    frame = np.array([3, 11, 19, 27, 60, 61])
-    time = frame + offset + drift * (frame - middle)
-
+def test_key_frames_on_one_clock_are_common_and_of_their_time():
     def pose(t):
         return Rotation.from_rotvec(np.outer(t, [0.01, 0.02, -0.005])).as_matrix(), np.outer(t, [0.1, 0, 0.2])
 
-    rotation, centre = pose(time)
-    translation = -np.einsum("nij,nj->ni", rotation, centre)
     lens = Camera("a", "pinhole", MATRIX, DISTORTION, np.eye(3), np.zeros(3), SIZE)
-    camera = KeyedCamera("a", lens, 1, frame, rotation, translation, np.arange(216.0).reshape(6, 6, 6))
-    moved = keys_on_reference_clock(camera, offset, drift, middle)
-    np.testing.assert_array_equal(moved.frame, np.round(time))
-    rotation, centre = pose(moved.frame)
-    np.testing.assert_allclose(moved.rotation, rotation, atol=1e-12)
-    np.testing.assert_allclose(moved.centre, centre, atol=1e-10)
-    np.testing.assert_array_equal(moved.covariance, camera.covariance)
-    crowded = keys_on_reference_clock(KeyedCamera("a", lens, 1, np.arange(6), *pose(np.arange(6))), 0.2, -0.4)
-    assert (np.diff(crowded.frame) > 0).all()
-    one = KeyedCamera("a", lens, 1, frame[:1], camera.rotation[:1], translation[:1])
-    assert keys_on_reference_clock(one, 2.6).frame.tolist() == [6]
+    shifts = [(0.0, 0.0, 50.0), (-12.4, 1e-3, 50.0)]
+    cameras, paths = [], []
+    for name, (offset, drift, middle) in zip("ab", shifts, strict=True):
+        frame = np.arange(100)
+        rotation, centre = pose(frame + offset + drift * (frame - middle))
+        translation = -np.einsum("nij,nj->ni", rotation, centre)
+        known = (frame < 40) | (frame > 47)
+        covariance = np.broadcast_to(np.eye(6), (100, 6, 6))
+        paths.append(CameraPath(name, frame, rotation, translation, covariance, known, frame % 8 == 0))
+        keys = frame[::8]
+        cameras.append(KeyedCamera(name, lens, 1, keys, rotation[keys], translation[keys]))
+    moved = keys_on_one_clock(cameras, paths, shifts)
+    assert (moved[0].frame % 8 == 0).all()
+    assert len(np.intersect1d(moved[0].frame, moved[1].frame)) >= 9
+    assert 40 not in moved[0].frame  # where the path is not known
+    for camera in moved:
+        rotation, centre = pose(camera.frame)
+        np.testing.assert_allclose(camera.rotation, rotation, atol=1e-12)
+        np.testing.assert_allclose(camera.centre, centre, atol=1e-9)
+    one = replace(
+        cameras[1], frame=np.array([3]), rotation=rotation[:1], translation=cameras[1].translation[:1]
+    )
+    assert keys_on_one_clock([one], paths[1:], [(2.6, 0.0, 0.0)])[0].frame.tolist() == [6]
 
 
 def test_a_whole_offset_only_renames_the_frames():
