@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from acino_fte.cameras import Camera, CameraArray
-from acino_fte.data_tools.trajectory_fit import PathFit, fit_paths, meeting_points
+from acino_fte.data_tools.trajectory_fit import PathFit, fit_paths
 from acino_fte.data_tools.trajectory_motion import MotionModel, Pieces
 from acino_fte.data_tools.trajectory_rows import (
     Measurements,
@@ -35,6 +35,7 @@ from acino_fte.data_tools.trajectory_rows import (
     project_rows,
     take_pieces,
 )
+from acino_fte.data_tools.trajectory_start import meeting_points
 from acino_fte.errors import InputError
 
 SOURCES = ("views", "single", "filled", "extended")
