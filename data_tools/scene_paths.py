@@ -9,12 +9,13 @@ import numpy as np
 
 from acino_fte.data_tools.camera_keys import KeyedCamera
 from acino_fte.data_tools.camera_paths import CameraPath, PoseNoise, camera_path
-from acino_fte.data_tools.rigs import Rig, find_rigs, fuse_rig
+from acino_fte.data_tools.rigs import Rig, find_rigs, fuse_rig, mean_rotation
 from acino_fte.data_tools.scene_rows import Views, make_views
 from acino_fte.errors import InputError
 
 RigChoice = str | Sequence[Sequence[str]]
 _TURN_PX, _DISTANCE = 1.0, 100.0  # of poses that nothing is known of: pixels, and shift as a part of distance
+_STILL = 3.0  # spread of a camera's key frames in standard deviations of an axis, below which it stands still
 _STANDS = "Camera '{}' has one image with a pose: it is taken to stand still."
 _MOVES = (
     "Camera '{}' has one image with a pose, and its dots show that it moved: it counts in that frame only. "
@@ -80,7 +81,8 @@ def scene_paths(
     """
     by_name = {camera.name: camera for camera in cameras}
     rigs, notes = [], []
-    for names in _chosen(rig, cameras, declared):
+    moving = [camera for camera in cameras if len(_standing(camera, pose_noise(camera))[0].frame) > 1]
+    for names in _chosen(rig, moving if rig == "auto" else cameras, declared):
         fused = fuse_rig([by_name[name] for name in names])
         rigs.append(fused)
         notes += _drift_notes(fused)
@@ -101,18 +103,18 @@ def scene_paths(
     for camera in cameras:
         if camera.name in paths:
             continue
-        noise[camera.name] = pose_noise(camera, extent)
+        camera, noise[camera.name] = _standing(camera, pose_noise(camera, extent))
         stands = camera.name not in not_standing
         paths[camera.name] = camera_path(
             camera, noise[camera.name], max_gap=max_gap, frames=frames if stands else None
         )
         base[camera.name] = len(bases)
         bases.append(paths[camera.name])
-        if len(camera.frame) == 1:
+        if len(by_name[camera.name].frame) == 1:
             notes.append(_STANDS.format(camera.name) if stands else _MOVES.format(camera.name))
     ordered = tuple(paths[camera.name] for camera in cameras)
     lenses = [camera.lens for camera in cameras]
-    alone = [camera for camera in cameras if all(camera.name not in one.names for one in rigs)]
+    alone = [camera for camera in moving if all(camera.name not in one.names for one in rigs)]
     attached = len(bases) > 1 and bool(find_rigs(alone))
     views = make_views(lenses, ordered, bases, [base[camera.name] for camera in cameras], attached)
     return ScenePaths(ordered, tuple(rigs), views, noise, tuple(notes))
@@ -122,6 +124,28 @@ def _extent(cameras: Sequence[KeyedCamera]) -> float:
     """How far the cameras are from each other, or move: root mean square from their middle."""
     centres = np.concatenate([camera.centre for camera in cameras])
     return float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+
+
+def _standing(camera: KeyedCamera, noise: PoseNoise) -> tuple[KeyedCamera, PoseNoise]:
+    """A camera whose key frames all have one pose, within their errors, as one with a single key frame."""
+    if len(camera.frame) == 1:
+        return camera, noise
+    centre, rotation = camera.centre.mean(0), mean_rotation(camera.rotation.sum(0))
+    spread = float(np.sqrt(((camera.centre - centre) ** 2).sum(1).mean()))
+    turn = np.trace(camera.rotation @ rotation.T, axis1=1, axis2=2)
+    angle = np.arccos(np.clip(0.5 * (turn - 1.0), -1.0, 1.0))
+    if spread > _STILL * noise.shift or float(np.sqrt((angle**2).mean())) > _STILL * noise.turn:
+        return camera, noise
+    one = KeyedCamera(
+        camera.name,
+        camera.lens,
+        camera.model_id,
+        camera.frame[:1],
+        rotation[None],
+        -(rotation @ centre)[None],
+    )
+    share = 1.0 / np.sqrt(len(camera.frame))
+    return one, PoseNoise(noise.turn * share, noise.shift * share, noise.shape)
 
 
 def pose_noise(camera: KeyedCamera, extent: float = 0.0) -> PoseNoise:
@@ -180,8 +204,10 @@ def _chosen(
 
 
 def _drift_notes(rig: Rig) -> list[str]:
+    third = max(len(rig.count) // 3, 1)  # a drift is the greatest difference of two means of so many images
+    worth = _LONG_DRIFT * max(1.0, 2.0 * float(np.sqrt(2.0 / third)))
     turn, shift = float(np.max(rig.noise.turn)), float(np.max(rig.noise.shift))
-    if rig.drift_turn < _LONG_DRIFT * turn and rig.drift_shift < _LONG_DRIFT * shift:
+    if rig.drift_turn < worth * turn and rig.drift_shift < worth * shift:
         return []
     return [
         f"The rig of {', '.join(rig.names)} is not rigid: one turned by {np.degrees(rig.drift_turn):.2g}°"

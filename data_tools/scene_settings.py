@@ -107,8 +107,8 @@ def _value(key: str, value: Any, path: Path) -> Any:
         rigs = [value] if all(not isinstance(part, list) for part in value) else value
         if all(isinstance(part, list) and len(part) > 1 for part in rigs):
             return tuple(tuple(str(name) for name in part) for part in rigs)
-    if key == "rig" and value in ("auto", "none"):
-        return value
+    if key == "rig" and (value is False or value in ("auto", "none")):  # YAML reads off and no as false
+        return value or "none"
     if key in ("model", "gravity") and isinstance(value, str):
         beside = path.parent / value
         if key == "model":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acino_fte.data_tools.individual_rows import identity
 from acino_fte.data_tools.scene_tracks import SOURCES, SceneTracks
 from acino_fte.data_tools.similarity import Similarity, align_similarity
 from acino_fte.errors import InputError
@@ -88,7 +89,7 @@ def read_truth(path: Path) -> SceneTruth:
     if not (np.isfinite(frame) & (frame == np.round(frame))).all():
         row = int(np.flatnonzero(~(frame == np.round(frame)))[0])
         raise InputError("A frame is not a whole number.", file=path, found=f"row {row + 2}")
-    individual = np.array([text.strip() for text in table[name]], dtype=object)
+    individual = np.array([identity(text) for text in table[name]], dtype=object)
     known = np.isfinite(position).all(1)
     return SceneTruth(individual[known], frame[known].astype(np.int64), position[known])
 

@@ -28,10 +28,13 @@ LONGEST = (
     "test_lily",
     "test_lily_ladder",
     "test_docs",
+    "test_scene_reaches",
     "test_calibration",
     "test_run_cli",
     "test_plots",
     "test_recovery",
+    "test_scene_tutorial",
+    "test_time_offsets",
 )
 
 
