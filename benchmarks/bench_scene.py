@@ -288,12 +288,13 @@ def opencv_loop(scene: Scene, views: Views, rows: SceneRows) -> np.ndarray:
             continue
         point = rows.point[dots[0]]
         frame = int(rows.frame[point])
-        matrices = []
+        matrices: list[Any] = []
         for k in dots:
-            first, pose = poses[rows.camera[k]]
-            matrices.append(pose[min(max(frame - first, 0), len(pose) - 1)])
+            begin, pose = poses[rows.camera[k]]
+            matrices.append(pose[min(max(frame - begin, 0), len(pose) - 1)])
         if len(dots) == 2:
-            x = cv2.triangulatePoints(*matrices, normal[dots[0]], normal[dots[1]])[:, 0]
+            first, second = matrices
+            x = cv2.triangulatePoints(first, second, normal[dots[0]], normal[dots[1]])[:, 0]
         else:
             system = np.concatenate(
                 [normal[k][:, None] * m[2] - m[:2] for k, m in zip(dots, matrices, strict=True)]
