@@ -2,10 +2,9 @@
 
 Centres and rotations of the key frames are noisy points on smooth curves. Centres follow
 :mod:`wiener_path` with p = 3, or with p = 2 where key frames are too far apart for the motion. Rotations are
-unrolled into a curve of three angles, ρ_(k+1) = ρ_k + log(R_(k+1) R_kᵀ), which is smoothed like a centre; the
-difference to the interpolating spline of the same angles, which is small, turns SciPy's rotation spline
-through the key frames. Nothing is made up before the first key frame, after the last one, or across long
-gaps. Shapes: K key frames, N frames.
+unrolled into a curve of three angles, ρ_(k+1) = ρ_k + log(R_(k+1) R_kᵀ), which is smoothed like a centre and
+rolled up again from the key frames on both sides. Nothing is made up before the first key frame, after the
+last one, or across long gaps. Shapes: K key frames, N frames.
 """
 
 from __future__ import annotations
@@ -14,9 +13,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from acino_fte.cameras import Camera
+from acino_fte.data_tools.rotations import rotation_matrix, rotation_vector
 from acino_fte.data_tools.wiener_path import WienerPath, fit_wiener_path
 
 if TYPE_CHECKING:
@@ -134,7 +133,7 @@ def camera_path(
         max_gap = GAP_STEPS * float(np.median(np.diff(camera.frame)))
     keys = np.arange(len(camera.frame))
     for _ in range(_ROUNDS):
-        time, rotation = camera.frame[keys], Rotation.from_matrix(camera.rotation[keys])
+        time, rotation = camera.frame[keys], camera.rotation[keys]
         place, unrolled = camera.centre[keys], unroll(rotation)
         centres = _curve(time, place, shift[keys], max_gap)
         turns = _curve(time, unrolled, turn[keys], max_gap)
@@ -148,7 +147,7 @@ def camera_path(
     known = np.isfinite(centre_variance)
     nearest = _nearest_known(known)
     centre, angles = centre[nearest], angles[nearest]
-    matrix = _turned(rotation, time, unrolled, frame[nearest], angles).as_matrix()
+    matrix = roll(rotation, time, unrolled, frame[nearest], angles)
     covariance = _covariance(
         turn_variance[nearest], centre_variance[nearest], np.isin(frame, time), noise.shape
     )
@@ -188,28 +187,31 @@ def _shift_in_world(covariance: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     return change @ covariance @ change.transpose(0, 2, 1)
 
 
-def unroll(rotation: Rotation) -> np.ndarray:
-    """The rotations of key frames rolled out into a curve of three angles, (K, 3), rad; the first is 0."""
-    steps = (rotation[1:] * rotation[:-1].inv()).as_rotvec()
+def unroll(rotation: np.ndarray) -> np.ndarray:
+    """Rotations (K, 3, 3) of key frames rolled out into a curve of three angles, (K, 3), rad, from 0."""
+    steps = rotation_vector(rotation[1:] @ rotation[:-1].transpose(0, 2, 1))
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
-def _turned(
-    rotation: Rotation, time: np.ndarray, unrolled: np.ndarray, frame: np.ndarray, angles: np.ndarray
-) -> Rotation:
-    """The rotation spline through the key frames, turned by what smoothing changed in the angles."""
-    from scipy.interpolate import CubicSpline
+def roll(
+    rotation: np.ndarray, time: np.ndarray, unrolled: np.ndarray, frame: np.ndarray, angles: np.ndarray
+) -> np.ndarray:
+    """Rotations (N, 3, 3) of frames whose angles (N, 3) lie on the curve of the key frames' (K, 3).
 
-    if len(time) < 3:
-        between = RotationSpline(time, rotation)(frame)
-        through = np.stack([np.interp(frame, time, column) for column in unrolled.T], axis=1)
-    else:
-        between, through = RotationSpline(time, rotation)(frame), CubicSpline(time, unrolled)(frame)
-    return Rotation.from_rotvec(angles - through) * between
+    From the key frame before, exp(ρ(t) − ρ_k) R_k, and from the one after. The two differ by what turns about
+    other axes on the way do to each other, and are blended by a smooth step.
+    """
+    k = np.clip(np.searchsorted(time, frame, side="right") - 1, 0, len(time) - 2)
+    before = rotation_matrix(angles - unrolled[k]) @ rotation[k]
+    after = rotation_matrix(angles - unrolled[k + 1]) @ rotation[k + 1]
+    way = np.clip((frame - time[k]) / (time[k + 1] - time[k]), 0.0, 1.0)
+    share = way**2 * (3.0 - 2.0 * way)
+    apart = rotation_vector(after @ before.transpose(0, 2, 1))
+    return rotation_matrix(share[:, None] * apart) @ before
 
 
 def _misplaced(
-    path: WienerPath, points: np.ndarray, noise: np.ndarray, rotation: Rotation | None = None
+    path: WienerPath, points: np.ndarray, noise: np.ndarray, rotation: np.ndarray | None = None
 ) -> np.ndarray:
     """Key frames (K,) far from where the others predict them; of angles with the rotations they stand for.
 
@@ -230,8 +232,8 @@ def _misplaced(
     off = points[which] - mean
     before = np.maximum(np.searchsorted(rest, which) - 1, 0)
     if rotation is not None:
-        step = Rotation.from_rotvec(np.nan_to_num(mean - others[before]))
-        found = (rotation[which] * (step * rotation[rest[before]]).inv()).as_rotvec()
+        expected = rotation_matrix(np.nan_to_num(mean - others[before])) @ rotation[rest[before]]
+        found = rotation_vector(rotation[which] @ expected.transpose(0, 2, 1))
         off = np.where(np.isfinite(mean), found, np.nan)
     left = curve.deleted_distance(others, noise[rest])
     usual = float(np.median(left))

@@ -17,11 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from acino_fte.cameras import Camera
 from acino_fte.data_tools.camera_keys import KeyedCamera
 from acino_fte.data_tools.camera_paths import CameraPath, PoseNoise
+from acino_fte.data_tools.rotations import cross_matrix, rotation_vector
 from acino_fte.errors import InputError
 
 _COMMON = 5  # key frames that two cameras must share
@@ -83,15 +83,6 @@ class Rig:
         return CameraPath(name, base.frame, rotation, translation, covariance, base.known, base.key)
 
 
-def cross_matrix(vector: np.ndarray) -> np.ndarray:
-    """[v]× (…, 3, 3) of vectors (…, 3): [v]× w = v × w."""
-    out = np.zeros((*vector.shape, 3))
-    x, y, z = np.moveaxis(vector, -1, 0)
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
-    return out
-
-
 def mean_rotation(matrices: np.ndarray) -> np.ndarray:
     """The rotation nearest to a sum of rotations (…, 3, 3)."""
     u, _, vt = np.linalg.svd(matrices)
@@ -123,7 +114,7 @@ def _is_rigid(first: KeyedCamera, second: KeyedCamera) -> bool:
         return False
     turn = second.rotation[b] @ first.rotation[a].transpose(0, 2, 1)
     shift = np.einsum("kij,kj->ki", first.rotation[a], second.centre[b] - first.centre[a])
-    turns = Rotation.from_matrix(turn @ mean_rotation(turn.sum(0)).T).as_rotvec()
+    turns = rotation_vector(turn @ mean_rotation(turn.sum(0)).T)
     shifts = shift - np.median(shift, axis=0)
     distance = float(np.linalg.norm(np.median(shift, axis=0)))
     spread_turn, spread_shift = (float(np.sqrt(np.median((d**2).sum(1)))) for d in (turns, shifts))
@@ -232,7 +223,7 @@ class _Averaging:
         ideal = self._sensor @ self._rig[:, None]
         turn = np.zeros(self._centre.shape)
         off = self._rotation[self._seen] @ ideal[self._seen].transpose(0, 2, 1)
-        turn[self._seen] = Rotation.from_matrix(off).as_rotvec()
+        turn[self._seen] = rotation_vector(off)
         lever = np.einsum("kji,cj->kci", self._rig, self._offset)
         shift = np.where(self._seen[..., None], self._centre - self._rig_centre[:, None] - lever, 0.0)
         return turn, shift
@@ -273,7 +264,7 @@ class _Averaging:
             _von_neumann(d[used[:, c], c]) for d in (turn, shift) for c in range(len(self._names))
             if used[:, c].sum() > _COMMON
         ]  # fmt: skip
-        place = Rotation.from_matrix(self._rig[sure]).as_matrix()
+        place = self._rig[sure]
         translation = -np.einsum("kij,kj->ki", place, self._rig_centre[sure])
         keys = KeyedCamera("rig", _NO_LENS, -1, frames[sure], place, translation)
         return Rig(

@@ -17,7 +17,7 @@ import numpy as np
 
 from acino_fte.cameras import Camera, CameraArray
 from acino_fte.data_tools.camera_paths import CameraPath
-from acino_fte.data_tools.rigs import cross_matrix
+from acino_fte.data_tools.rotations import cross_matrix
 from acino_fte.data_tools.tracks2d import Tracks2D
 from acino_fte.data_tools.trajectory_rows import Measurements
 

@@ -307,8 +307,6 @@ def scene_scale(measured: Sequence[tuple[KnownDistance, MeasuredDistance]]) -> S
     InputError
         There is no distance.
     """
-    from scipy.special import chdtrc
-
     if not measured:
         raise InputError("The scale needs a known distance.", expected=_EXAMPLE, found="none")
     known, lengths = zip(*measured, strict=True)
@@ -322,7 +320,7 @@ def scene_scale(measured: Sequence[tuple[KnownDistance, MeasuredDistance]]) -> S
     sd = 1.0 / np.sqrt((1 / variance).sum())
     notes = [note for one in lengths for note in one.notes]
     freedom = len(log) - 1
-    if freedom and chdtrc(freedom, chi2) < _P_ODD:
+    if freedom and _chance(freedom, chi2) < _P_ODD:
         sd *= np.sqrt(chi2 / freedom)
         notes.append(_odd_one(known, log, variance))
     factor = float(np.exp(mean))
@@ -336,6 +334,13 @@ def scene_scale(measured: Sequence[tuple[KnownDistance, MeasuredDistance]]) -> S
         chi2=chi2,
         notes=tuple(notes),
     )
+
+
+def _chance(freedom: int, chi2: float) -> float:
+    """Of a χ² this large or larger."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(freedom, chi2))
 
 
 def _odd_one(known: Sequence[KnownDistance], log: np.ndarray, variance: np.ndarray) -> str:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acino_fte.data_tools.csv_columns import csv_bytes, decimals, labels
+from acino_fte.data_tools.rotations import rotation_quaternion
 from acino_fte.data_tools.scene_tracks import SOURCES
 
 if TYPE_CHECKING:
@@ -91,15 +92,13 @@ def paths_text(result: SceneResult, places: int = _FEWEST) -> bytes:
         mean square of the three axes), sd_rotation_deg (likewise), known (0: too far from a key frame, no
         pose), key (1: from an image of the model).
     """
-    from scipy.spatial.transform import Rotation
-
     tables = []
     for path in result.paths:
         known = np.asarray(path.known, dtype=bool)
         centre = np.where(known[:, None], path.centre, np.nan)
         turn = np.full((len(known), 4), np.nan)
         if known.any():
-            turn[known] = Rotation.from_matrix(path.rotation[known]).as_quat()[:, [3, 0, 1, 2]]
+            turn[known] = rotation_quaternion(path.rotation[known])[:, [3, 0, 1, 2]]
         turn *= np.where(turn[:, :1] < 0, -1.0, 1.0)
         variance = np.where(known[:, None], np.diagonal(path.covariance, axis1=1, axis2=2), np.nan)
         spread = np.sqrt(np.maximum(variance.reshape(-1, 2, 3).mean(2), 0.0))

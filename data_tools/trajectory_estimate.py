@@ -6,8 +6,8 @@ Shapes: T nodes.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import minimize, minimize_scalar
 
+from acino_fte.data_tools.small_search import bounded_minimum, descend
 from acino_fte.data_tools.trajectory_motion import (
     N_LAGS,
     MotionModel,
@@ -22,7 +22,7 @@ _WINDOW, _SAMPLE = 50, 1500  # frames in a window, nodes to estimate the prior f
 _BROAD = np.array([2.0, 1.5, 1.5])  # standard deviations of log q and atanh r before any data
 _BROAD_AGILITY, _MOST_AGILE = 0.7, 2.5  # of the logarithm: standard deviation before any data, and bound
 _FEW = 10  # frames below which the moments say nothing
-_FLAT = 0.005  # gradient at which the search ends, about the error of log q
+_FLAT = 0.002  # gradient at which the search ends, less than the error of log q
 _REACH = 3.5  # largest inverse hyperbolic tangent of a partial autocorrelation
 
 
@@ -68,8 +68,7 @@ def estimate_motion(
         return (penalty - evidence) / (3.0 * pieces.n_nodes)  # curvature about 1 for log q
 
     begin = np.array([np.log(first.step), *np.arctanh(np.clip(first.memory, -0.99, 0.99))])
-    found = minimize(value, begin, method="BFGS", options={"gtol": _FLAT, "eps": 1e-3, "maxiter": 25})
-    return _motion(found.x, scale)
+    return _motion(descend(value, begin, flat=_FLAT), scale)
 
 
 def estimate_agility(
@@ -119,9 +118,7 @@ def _agility(
             return np.inf
         return 0.5 * (log_agility / _BROAD_AGILITY) ** 2 - evidence
 
-    bounds = (-_MOST_AGILE, _MOST_AGILE)
-    found = minimize_scalar(value, bounds=bounds, method="bounded", options={"xatol": 0.02})
-    return float(np.exp(found.x))
+    return float(np.exp(bounded_minimum(value, -_MOST_AGILE, _MOST_AGILE, 0.02)))
 
 
 def log_evidence(

@@ -20,6 +20,8 @@ from math import factorial
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from acino_fte.data_tools.small_search import bounded_minimum
+
 _SEARCH = (-12.0, 45.0)  # log of q over the noise's variance
 
 
@@ -171,18 +173,14 @@ class _Chain:
 
     def best_density(self) -> float:
         """q of greatest marginal likelihood, within wide bounds."""
-        from scipy.optimize import minimize_scalar
-
         if not self._n_joined:
             return float(np.median(self._noise))
         base = float(np.log(np.median(self._noise)))
-        found = minimize_scalar(
-            lambda x: -self._log_evidence(np.exp(base + x)) / len(self._points),
-            bounds=_SEARCH,
-            method="bounded",
-            options={"xatol": 0.01},
-        )
-        return float(np.exp(base + found.x))
+
+        def value(x: float) -> float:
+            return -self._log_evidence(float(np.exp(base + x))) / len(self._points)
+
+        return float(np.exp(base + bounded_minimum(value, *_SEARCH, 0.01)))
 
     def _blocks(self, q: float) -> tuple[np.ndarray, np.ndarray]:
         own = self._own / q

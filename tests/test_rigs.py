@@ -7,7 +7,8 @@ import pytest
 from scene_worlds import Motion, disturbed, exact_path, keyed, pose_errors, random_similarity, rms
 from scipy.spatial.transform import Rotation
 
-from acino_fte.data_tools.rigs import Rig, cross_matrix, find_rigs, fuse_rig, mean_rotation
+from acino_fte.data_tools.rigs import Rig, find_rigs, fuse_rig, mean_rotation
+from acino_fte.data_tools.rotations import cross_matrix
 from acino_fte.data_tools.scene_paths import scene_paths
 from acino_fte.errors import InputError
 
