@@ -4,7 +4,7 @@ that is known.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +46,12 @@ _STATES: tuple[tuple[str, str], ...] = (
 _SINGLE, _BETWEEN = SOURCES.index("single"), SOURCES.index("interpolated")
 
 
-def save_scene_figures(drawing: SceneDrawing, folder: Path, families: list[str] | None = None) -> list[Path]:
+def save_scene_figures(
+    drawing: SceneDrawing,
+    folder: Path,
+    families: list[str] | None = None,
+    names: Sequence[str] | None = None,
+) -> list[Path]:
     """Draw the figures of a scene into a folder, which is made if need be.
 
     Parameters
@@ -57,6 +62,8 @@ def save_scene_figures(drawing: SceneDrawing, folder: Path, families: list[str] 
         For ``NAME.png`` (150 dots per inch) and ``NAME.pdf``, names as in :data:`FIGURES`.
     families : list of str, optional
         Fonts, the first one first.
+    names : sequence of str, optional
+        Some of :data:`FIGURES`; by default all.
 
     Returns
     -------
@@ -69,8 +76,8 @@ def save_scene_figures(drawing: SceneDrawing, folder: Path, families: list[str] 
     if families:
         style["font.family"] = families
     with matplotlib.rc_context(style):
-        for name, draw in FIGURES.items():
-            figure = draw(drawing)
+        for name in FIGURES if names is None else names:
+            figure = FIGURES[name](drawing)
             written += [folder / f"{name}.png", folder / f"{name}.pdf"]
             figure.savefig(
                 written[-2], dpi=DPI, metadata={"Software": None}, pil_kwargs={"compress_level": 1}

@@ -71,7 +71,7 @@ def descend(
     start: np.ndarray,
     *,
     flat: float,
-    step: float = 1e-3,
+    step: float = 1e-4,
     most: int = 25,
 ) -> np.ndarray:
     """Where a smooth function is least, by the method of Broyden, Fletcher, Goldfarb and Shanno (1970).
@@ -85,16 +85,16 @@ def descend(
     flat : float
         Largest component of the gradient at which the search ends.
     step : float
-        Of the central differences that give the gradient.
+        Of the forward differences that give the gradient.
     most : int
         Steps.
     """
 
-    def gradient(x: np.ndarray) -> np.ndarray:
-        shifts = step * np.eye(len(x))
-        return np.array([(value(x + shift) - value(x - shift)) / (2.0 * step) for shift in shifts])
+    def gradient(x: np.ndarray, at_x: float) -> np.ndarray:
+        return np.array([(value(x + shift) - at_x) / step for shift in step * np.eye(len(x))])
 
-    x, at_x, slope = np.array(start, dtype=float), value(start), gradient(start)
+    x, at_x = np.array(start, dtype=float), value(start)
+    slope = gradient(x, at_x)
     inverse, fresh = np.eye(len(x)), True
     for _ in range(most):
         if not np.isfinite(slope).all() or np.abs(slope).max() <= flat:
@@ -107,7 +107,7 @@ def descend(
             inverse, fresh = np.eye(len(x)), True
             continue
         x, at_x = x + moved, at_moved
-        new = gradient(x)
+        new = gradient(x, at_x)
         turned, slope = new - slope, new
         bend = float(moved @ turned)
         if bend > 1e-12:
