@@ -7,7 +7,7 @@ same recording has the same coordinates in every gauge, and it is never mirrored
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 WAYS = ("cameras", "plane", "down", "none")
 """Where gravity may come from, besides a file of accelerations."""
 
+_GROUND, _FACING = 30, 0.87  # points of a ground; cosine of the angle between its normal and the view
 _ROUND = 0.95  # second spread of the path over the first, from which it has no main direction
 _SOME_WAY = 0.05  # a shift from start to end that counts, as a share of the path's spread
 
@@ -108,9 +109,29 @@ def metric_upright(axes: AxesEstimate, factor: float = 1.0) -> Similarity:
     return Similarity(factor, axes.rotation, factor * axes.translation)
 
 
+def _over_ground(keys: KeyPoses, guess: Up, cloud: object | None) -> Up:
+    """Of a straight path, which tells nothing: up from the ground that cameras look down on, or the guess."""
+    points = np.zeros((0, 3)) if cloud is None else np.asarray(getattr(cloud, "xyz", cloud), dtype=float)
+    if len(points) < _GROUND:
+        return guess
+    try:
+        plane = up_from_plane(keys, points)
+    except InputError:
+        return guess
+    view = keys.rotation[:, 2].mean(axis=0)
+    if -(plane.direction @ view) < _FACING * np.linalg.norm(view):
+        return guess
+    note = (
+        "The path is straight, and the cameras face a plane of the cloud: they are taken to look down on the "
+        "ground. Cameras before a wall need another source of gravity."
+    )
+    return replace(plane, how=f"cameras that look down on a {plane.how}", height=None, notes=(note,))
+
+
 def _up(keys: KeyPoses, cameras: Sequence[KeyedCamera], gravity: Path | str, cloud: object | None) -> Up:
     if str(gravity) == "cameras":
-        return up_from_cameras(keys)
+        up = up_from_cameras(keys)
+        return up if np.isfinite(up.sd) else _over_ground(keys, up, cloud)
     if str(gravity) == "down":
         return up_against_view(keys)
     if str(gravity) == "plane":

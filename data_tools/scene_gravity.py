@@ -104,7 +104,7 @@ def up_from_cameras(keys: KeyPoses) -> Up:
     1. The normal of the plane that their paths lie in, when they spread in one.
     2. The direction that is level with no camera's image-right direction, when the cameras turned (Brown and
        Lowe 2007, automatic straightening): people and gimbals hold the horizon level.
-    3. The mean image-up direction, made perpendicular to a straight path.
+    3. The mean image-up direction, made perpendicular to a straight path: a guess, of unknown uncertainty.
 
     The sign is that of the mean image-up direction while it leans at least 20° out of the level; cameras
     that look straight down have none, and up is against their view. A camera that looks straight up cannot
@@ -183,12 +183,12 @@ def _image_up(keys: KeyPoses) -> Up:
                 up = level
         return unit(up)
 
-    how = "mean image-up direction" + (", perpendicular to the straight path" if straight else "")
+    how = "a guess: mean image-up direction" + (", perpendicular to the straight path" if straight else "")
     note = (
         "Up is only what the images' top says: the cameras neither spread in a plane nor turned. Cameras "
         "that look down or are tilted need another source of gravity (a ground plane, accelerometers)."
     )
-    return Up(direction(keys), how, jackknife(direction, keys), sure=False, notes=(note,))
+    return Up(direction(keys), how, float("nan"), sure=False, notes=(note,))
 
 
 def _sign(keys: KeyPoses, normal: np.ndarray) -> tuple[int, str, bool, tuple[str, ...]]:

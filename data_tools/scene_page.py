@@ -176,7 +176,8 @@ def _colour(metrics: dict[str, Any]) -> str:
     """``green`` for tracks in metres and upright, ``amber`` for others, ``red`` without any."""
     if not metrics["n_points"]["all"]:
         return "red"
-    return "green" if metrics["scale"] and upright_by(metrics) else "amber"
+    sure = (metrics["axes"] or {}).get("tilt_sd_deg") is not None
+    return "green" if metrics["scale"] and upright_by(metrics) and sure else "amber"
 
 
 def _headline(metrics: dict[str, Any]) -> str:
