@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,7 +96,9 @@ def scene_paths(
             fused.keys, PoseNoise(fused.noise.turn * share, fused.noise.shift * share), max_gap=max_gap
         )
         for name in fused.names:
-            paths[name], noise[name] = fused.sensor_path(middle, name), fused.noise
+            path = fused.sensor_path(middle, name)
+            paths[name] = replace(path, key=path.key & np.isin(path.frame, by_name[name].frame))
+            noise[name] = fused.noise
             base[name] = len(bases)
         bases.append(middle)
     extent = _extent(cameras)
