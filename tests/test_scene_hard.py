@@ -1,4 +1,4 @@
-"""Scenes that are hard: long single views, cameras that stand or do not, clocks, wild files, straight flights."""
+"""Hard scenes: long single views, cameras that stand or do not, clocks, wild files, straight flights."""
 
 from dataclasses import replace
 
