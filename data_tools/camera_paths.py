@@ -28,7 +28,7 @@ _LEAST_TURN, _LEAST_SHIFT = 1e-7, 1e-8  # rad; share of the path's extent. Nothi
 _FORESEEN, _MEDIAN = (
     2.5,
     0.79,
-)  # of χ²/3: how far off key frames may be from what the others predict; its median
+)  # how far off key frames may be from what others predict, in the median of χ²/3
 _SUSPECT, _MISPLACED = 10.0, 50.0  # squared distance of a key frame from where the others have it, as usual
 _ROUNDS = 5  # of looking for misplaced key frames
 

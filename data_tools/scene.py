@@ -17,9 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acino_fte.data_tools.camera_keys import KeyedCamera
-from acino_fte.data_tools.colmap import ColmapModel, read_colmap
-from acino_fte.data_tools.colmap_covariance import PoseErrors, mended, pose_errors
-from acino_fte.data_tools.colmap_images import keyed_cameras, parse_image_names
 from acino_fte.data_tools.point_cloud import PointCloud
 from acino_fte.data_tools.scene_noise import NOISE_FLOOR
 from acino_fte.data_tools.scene_notes import (
@@ -31,6 +28,7 @@ from acino_fte.data_tools.scene_notes import (
 )
 from acino_fte.data_tools.scene_paths import RigChoice, ScenePaths, scene_paths
 from acino_fte.data_tools.scene_points import retriangulate, triangulate_points
+from acino_fte.data_tools.scene_reading import SceneFiles
 from acino_fte.data_tools.scene_record import scene_record
 from acino_fte.data_tools.scene_result import (
     SceneResult,
@@ -41,7 +39,7 @@ from acino_fte.data_tools.scene_result import (
 from acino_fte.data_tools.scene_rows import scene_rows
 from acino_fte.data_tools.scene_smoothing import smooth_points
 from acino_fte.data_tools.similarity import Similarity
-from acino_fte.data_tools.tracks import PixelOrigin, read_scene_tracks
+from acino_fte.data_tools.tracks import PixelOrigin
 from acino_fte.data_tools.tracks2d import Tracks2D
 from acino_fte.errors import InputError
 
@@ -149,50 +147,17 @@ class Scene:
         InputError
             A file is missing, cannot be read, or does not fit the others.
         """
-        folder = Path(path)
-        if not folder.is_dir():
-            raise InputError(
-                "There is no such folder.",
-                file=folder,
-                expected="a folder with a COLMAP model and 2D tracks",
-                remedy="check the path",
-            )
-        read = read_colmap(folder if model is None else model)
-        images = parse_image_names(read.names, pattern)
-        errors = pose_errors(read)
-        covariance = errors.covariance
-        if adjust_poses:
-            read, covariance = mended(read, errors), errors.after_step
-        cameras = keyed_cameras(read, images, covariance)
-        place = Path(tracks) if Path(tracks).is_absolute() else folder / tracks
-        place = place if place.exists() else Path(tracks)
-        if not place.exists():
-            raise InputError(
-                "There are no tracks.",
-                file=folder / tracks,
-                expected=f"a folder with a file of tracks for each of {', '.join(c.name for c in cameras)}",
-                remedy="name the folder or file of the tracks (--tracks)",
-            )
-        files = read_scene_tracks(
-            place,
-            [camera.name for camera in cameras],
-            node=node,
-            cm_per_pixel=cm_per_pixel,
-            pixel_origin=pixel_origin,
-        )
-        cloud = read.cloud
-        if dense is not None:
-            from acino_fte.data_tools.point_cloud import read_ply
-
-            cloud = read_ply(dense)
+        read = SceneFiles(Path(path), tracks, model, dense)
+        found = read.model(pattern, adjust_poses)
+        files = read.tracks(found.cameras, node, cm_per_pixel, pixel_origin)
         return cls(
-            name=folder.resolve().name,
-            cameras=cameras,
+            name=read.folder.resolve().name,
+            cameras=found.cameras,
             tracks=files.tracks,
-            cloud=cloud,
+            cloud=read.cloud(found.cloud),
+            declared_rigs=found.rigs,
             fps=fps,
-            declared_rigs=_declared(read, images.camera),
-            warnings=(*read.notes, *_adjustment_notes(errors, adjust_poses), *files.notes),
+            warnings=(*found.notes, *files.notes),
         )
 
     @property
@@ -381,24 +346,3 @@ class Scene:
             "warnings": notes,
         }
         return SceneResult(self, tracks, points, paths.paths, paths.rigs, fit.noise.px, numbers)
-
-
-def _declared(model: ColmapModel, names: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """The cameras of each rig that the model declares, where each of its sensors is one camera here."""
-    by_id: dict[int, set[str]] = {}
-    for camera_id, name in zip(model.camera_ids.tolist(), names, strict=True):
-        by_id.setdefault(camera_id, set()).add(name)
-    rigs = [[by_id.get(sensor, set()) for sensor in rig.camera_ids] for rig in model.declared_rigs]
-    whole = [rig for rig in rigs if all(len(name) == 1 for name in rig)]
-    return tuple(tuple(name for sensor in rig for name in sensor) for rig in whole)
-
-
-def _adjustment_notes(errors: PoseErrors, adjusted: bool) -> list[str]:
-    if errors.adjusted:
-        return []
-    if adjusted:
-        return ["The poses were moved to where the model's own observations have them."]
-    return [
-        "The poses are not where the model's own observations have them. Run a bundle adjustment, or let "
-        "them be moved there (--adjust-poses)."
-    ]

@@ -79,47 +79,61 @@ def scene_paths(
     InputError
         A rig names cameras that are not there, or cameras that cannot be one.
     """
-    by_name = {camera.name: camera for camera in cameras}
-    rigs, notes = [], []
     moving = [camera for camera in cameras if len(_standing(camera, pose_noise(camera))[0].frame) > 1]
+    found = _Gathered({camera.name: camera for camera in cameras}, max_gap)
     for names in _chosen(rig, moving if rig == "auto" else cameras, declared):
-        fused = fuse_rig([by_name[name] for name in names])
-        rigs.append(fused)
-        notes += _drift_notes(fused)
-    paths: dict[str, CameraPath] = {}
-    noise: dict[str, PoseNoise] = {}
-    bases: list[CameraPath] = []
-    base: dict[str, int] = {}
-    for fused in rigs:
-        share = 1.0 / np.sqrt(fused.count)
-        middle = camera_path(
-            fused.keys, PoseNoise(fused.noise.turn * share, fused.noise.shift * share), max_gap=max_gap
-        )
-        for name in fused.names:
-            path = fused.sensor_path(middle, name)
-            paths[name] = replace(path, key=path.key & np.isin(path.frame, by_name[name].frame))
-            noise[name] = fused.noise
-            base[name] = len(bases)
-        bases.append(middle)
+        found.add_rig(names)
     extent = _extent(cameras)
     for camera in cameras:
-        if camera.name in paths:
-            continue
-        camera, noise[camera.name] = _standing(camera, pose_noise(camera, extent))
-        stands = camera.name not in not_standing
-        paths[camera.name] = camera_path(
-            camera, noise[camera.name], max_gap=max_gap, frames=frames if stands else None
-        )
-        base[camera.name] = len(bases)
-        bases.append(paths[camera.name])
-        if len(by_name[camera.name].frame) == 1:
-            notes.append(_STANDS.format(camera.name) if stands else _MOVES.format(camera.name))
-    ordered = tuple(paths[camera.name] for camera in cameras)
-    lenses = [camera.lens for camera in cameras]
-    alone = [camera for camera in moving if all(camera.name not in one.names for one in rigs)]
-    attached = len(bases) > 1 and bool(find_rigs(alone))
-    views = make_views(lenses, ordered, bases, [base[camera.name] for camera in cameras], attached)
-    return ScenePaths(ordered, tuple(rigs), views, noise, tuple(notes))
+        if camera.name not in found.paths:
+            stands = camera.name not in not_standing
+            found.add_alone(camera, extent, frames if stands else None, stands)
+    alone = [camera for camera in moving if all(camera.name not in one.names for one in found.rigs)]
+    attached = len(found.bases) > 1 and bool(find_rigs(alone))
+    ordered = tuple(found.paths[camera.name] for camera in cameras)
+    base = [found.base[camera.name] for camera in cameras]
+    views = make_views([camera.lens for camera in cameras], ordered, found.bases, base, attached)
+    return ScenePaths(ordered, tuple(found.rigs), views, found.noise, tuple(found.notes))
+
+
+class _Gathered:
+    """Paths by the name of their camera, and what errs as one."""
+
+    def __init__(self, cameras: dict[str, KeyedCamera], max_gap: float | None) -> None:
+        self._cameras, self._max_gap = cameras, max_gap
+        self.rigs: list[Rig] = []
+        self.paths: dict[str, CameraPath] = {}
+        self.noise: dict[str, PoseNoise] = {}
+        self.bases: list[CameraPath] = []
+        self.base: dict[str, int] = {}
+        self.notes: list[str] = []
+
+    def add_rig(self, names: Sequence[str]) -> None:
+        """Cameras that keep their places, with one path."""
+        rig = fuse_rig([self._cameras[name] for name in names])
+        share = 1.0 / np.sqrt(rig.count)
+        noise = PoseNoise(rig.noise.turn * share, rig.noise.shift * share)
+        middle = camera_path(rig.keys, noise, max_gap=self._max_gap)
+        for name in rig.names:
+            path = rig.sensor_path(middle, name)
+            own = path.key & np.isin(path.frame, self._cameras[name].frame)
+            self.paths[name], self.noise[name] = replace(path, key=own), rig.noise
+            self.base[name] = len(self.bases)
+        self.bases.append(middle)
+        self.rigs.append(rig)
+        self.notes += _drift_notes(rig)
+
+    def add_alone(
+        self, camera: KeyedCamera, extent: float, frames: tuple[int, int] | None, stands: bool
+    ) -> None:
+        """A camera by itself."""
+        name, single = camera.name, len(camera.frame) == 1
+        camera, self.noise[name] = _standing(camera, pose_noise(camera, extent))
+        self.paths[name] = camera_path(camera, self.noise[name], max_gap=self._max_gap, frames=frames)
+        self.base[name] = len(self.bases)
+        self.bases.append(self.paths[name])
+        if single:
+            self.notes.append((_STANDS if stands else _MOVES).format(name))
 
 
 def _extent(cameras: Sequence[KeyedCamera]) -> float:
