@@ -176,7 +176,7 @@ def scene(
             metavar="FRAMES|SECONDSs",
             help="Longest gap of an individual that is filled: 30, or 1s.",
             rich_help_panel=_TRACKS,
-            show_default="30",
+            show_default="1s, or 30 without a frame rate",
         ),
     ] = None,
     noise_px: Annotated[
