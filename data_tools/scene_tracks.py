@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from acino_fte.data_tools.similarity import Similarity
 
 SOURCES = ("views", "single", "interpolated")
@@ -65,6 +67,33 @@ class SceneTracks:
     def standard_deviation(self) -> np.ndarray:
         """Of each coordinate, (T, 3), m."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    def to_table(self) -> pd.DataFrame:
+        """A row for each point, with the columns of ``tracks_3d.csv``.
+
+        Two ends of a wand are paired by ``table.set_index(["individual", "frame"])[["x", "y", "z"]]``.
+
+        Returns
+        -------
+        pandas.DataFrame
+            individual, frame, x, y, z, sd_x, sd_y, sd_z (m), source, n_views, reprojection_px,
+            reprojection_max_px.
+        """
+        import pandas as pd
+
+        sd = self.standard_deviation
+        return pd.DataFrame(
+            {
+                "individual": np.array([*self.individuals, ""], dtype=object)[self.individual],
+                "frame": self.frame,
+                **{axis: self.position[:, i] for i, axis in enumerate("xyz")},
+                **{f"sd_{axis}": sd[:, i] for i, axis in enumerate("xyz")},
+                "source": np.array(SOURCES, dtype=object)[self.source],
+                "n_views": self.n_views,
+                "reprojection_px": self.reprojection_median,
+                "reprojection_max_px": self.reprojection_max,
+            }
+        )
 
     def moved(self, change: Similarity) -> SceneTracks:
         """The same tracks in another world."""

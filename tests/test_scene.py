@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scene_worlds import nees, random_similarity, rms
 
@@ -13,6 +14,7 @@ pytest.importorskip("pycolmap")
 
 from acino_fte.data_tools.scene import Scene
 from acino_fte.data_tools.scene_folder import write_scene
+from acino_fte.data_tools.scene_tables import tracks_text
 from acino_fte.data_tools.scene_tracks import SOURCES
 from acino_fte.data_tools.similarity import Similarity
 from acino_fte.data_tools.simulate_scene import SceneSimulation, simulate_scene
@@ -320,3 +322,15 @@ def test_the_wrong_pixel_origin_shifts_all_dots(tmp_path):
     centre, corner = (Scene.from_colmap(folder, pixel_origin=origin) for origin in ("centre", "corner"))
     for a, b in zip(centre.tracks, corner.tracks, strict=True):
         np.testing.assert_allclose(a.xy - b.xy, 0.5)
+
+
+def test_a_table_has_what_the_file_has(tmp_path):
+    tracks = solved().tracks
+    table = tracks.to_table()
+    file = tmp_path / "tracks_3d.csv"
+    file.write_bytes(tracks_text(tracks))
+    written = pd.read_csv(file)
+    assert list(table.columns) == list(written.columns)
+    assert table["individual"].tolist() == written["individual"].astype(str).tolist()
+    assert table["source"].tolist() == written["source"].tolist()
+    np.testing.assert_allclose(table[["x", "y", "z"]], written[["x", "y", "z"]], atol=1e-5)
