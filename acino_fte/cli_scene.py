@@ -77,13 +77,14 @@ def scene(
         float | None, typer.Option(help="Frames per second of the recording.", rich_help_panel=_INPUT)
     ] = None,
     pixel_origin: Annotated[
-        _Origin,
+        _Origin | None,
         typer.Option(
             help="Do the tracks' pixels count from the centre of the first pixel (OpenCV, most trackers) or "
             "from its corner (COLMAP)?",
             rich_help_panel=_INPUT,
+            show_default="centre",
         ),
-    ] = _Origin.centre,
+    ] = None,
     node: Annotated[
         str | None,
         typer.Option(
@@ -221,13 +222,13 @@ def scene(
             model=model,
             pattern=pattern,
             fps=positive("--fps", fps),
-            pixel_origin=pixel_origin.value,
+            pixel_origin=None if pixel_origin is None else pixel_origin.value,
             node=node,
             cm_per_pixel=positive("--cm-per-pixel", cm_per_pixel),
             dense=dense,
             rig=rig_choice(rig),
             max_pose_gap=max_pose_gap,
-            time_offsets=time_offsets,
+            time_offsets=time_offsets or None,
             adjust_poses=adjust_poses,
             scale=tuple(scale) if scale else None,
             gravity=gravity,

@@ -21,13 +21,13 @@ class SceneOptions:
     model: Path | None
     pattern: str | None
     fps: float | None
-    pixel_origin: str
+    pixel_origin: str | None
     node: str | None
     cm_per_pixel: float | None
     dense: Path | None
     rig: Any
     max_pose_gap: str | None
-    time_offsets: bool
+    time_offsets: bool | None
     adjust_poses: bool
     scale: tuple[str, ...] | None
     gravity: str | None
@@ -40,7 +40,8 @@ class SceneOptions:
         from acino_fte.data_tools.scene_settings import read_scene_settings
 
         said = asdict(read_scene_settings(folder))
-        usual = {"tracks": "tracks", "rig": "auto", "gravity": "cameras", "scale": ()}
+        usual: dict[str, Any] = {"tracks": "tracks", "rig": "auto", "gravity": "cameras", "scale": ()}
+        usual |= {"pixel_origin": "centre", "time_offsets": False}
         mine = asdict(self)
         first: dict[str, Any] = {
             key: next((v for v in (mine[key], said[key], usual.get(key)) if v is not None), None)

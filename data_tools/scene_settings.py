@@ -45,6 +45,12 @@ class SceneSettings:
         Folder of the 2D tracks.
     model : Path, optional
         Folder of the COLMAP model.
+    pixel_origin : str, optional
+        ``centre`` or ``corner`` of the first pixel, which the tracks count from.
+    noise_px : float, optional
+        Standard deviation of a dot's coordinate.
+    time_offsets : bool, optional
+        Whether the cameras' clocks differ.
     """
 
     pattern: str | None = None
@@ -54,6 +60,9 @@ class SceneSettings:
     gravity: str | None = None
     tracks: str | None = None
     model: Path | None = None
+    pixel_origin: str | None = None
+    noise_px: float | None = None
+    time_offsets: bool | None = None
 
 
 def read_scene_settings(folder: Path) -> SceneSettings:
@@ -97,8 +106,12 @@ def read_scene_settings(folder: Path) -> SceneSettings:
 def _value(key: str, value: Any, path: Path) -> Any:
     """A value as :class:`SceneSettings` has it."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if key == "fps" and number and 0 < value < float("inf"):
+    if key in ("fps", "noise_px") and number and 0 < value < float("inf"):
         return float(value)
+    if key == "time_offsets" and isinstance(value, bool):
+        return value
+    if key == "pixel_origin" and value in ("centre", "corner"):
+        return value
     if key == "scale":
         texts = [value] if isinstance(value, str) else value
         if isinstance(texts, list) and all(isinstance(text, str) for text in texts):
@@ -133,4 +146,7 @@ _EXPECTED = {
     "gravity": "cameras, plane, down, none, or a file",
     "tracks": "the name of a folder",
     "model": "the name of a folder",
+    "pixel_origin": "centre or corner",
+    "noise_px": "a number above 0",
+    "time_offsets": "true or false",
 }

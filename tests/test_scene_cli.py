@@ -191,6 +191,20 @@ def test_paths_in_the_scene_file_are_beside_it(tmp_path):
     assert found.rig == (("a", "b"), ("c", "d"))
 
 
+def test_what_a_recording_is_like_can_stand_in_the_scene_file(tmp_path, mine):
+    text = "pixel_origin: corner\nnoise_px: 1.5\ntime_offsets: true\nrig: off\n"
+    (tmp_path / "scene.yaml").write_text(text)
+    found = read_scene_settings(tmp_path)
+    assert (found.pixel_origin, found.noise_px, found.time_offsets) == ("corner", 1.5, True)
+    assert found.rig == "none"
+    (mine / "scene.yaml").write_text("pixel_origin: corner\nnoise_px: 1.5\n")
+    assert scene(mine, *PLAIN, "-o", "out").exit_code == 0
+    assert metrics_of("out")["noise_px"] == 1.5
+    assert metrics_of("out")["options"]["pixel_origin"] == "corner"
+    assert scene(mine, *PLAIN, "-o", "out", "--pixel-origin", "centre").exit_code == 0
+    assert metrics_of("out")["options"]["pixel_origin"] == "centre"
+
+
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
