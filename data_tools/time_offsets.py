@@ -191,7 +191,11 @@ def keys_on_one_clock(
     moved = []
     for camera, path, shift in zip(cameras, paths, shifts, strict=True):
         here = _path_at(path, *shift)
-        chosen = np.flatnonzero(here.known & (here.frame % step == 0))
+        own = own_time(here.frame, *shift)
+        place = np.clip(np.searchsorted(camera.frame, own), 1, max(len(camera.frame) - 1, 1))
+        beside = camera.frame[np.stack([place - 1, np.minimum(place, len(camera.frame) - 1)])]
+        near = np.abs(beside - own).min(0) <= 0.5 * step
+        chosen = np.flatnonzero(here.known & near & (here.frame % step == 0))
         if len(camera.frame) == 1 or not len(chosen):
             frame = np.round(camera.frame + shift[0] + shift[1] * (camera.frame - shift[2])).astype(int)
             moved.append(replace(camera, frame=frame[:1], **_first_key(camera)))
