@@ -76,7 +76,7 @@ def scene_result(n_frames=90, n_cameras=2, n_individuals=2, fps=30.0, scale=True
         warnings=("a warning of the reader",),
     )
     numbers = {"scale": {"factor": 2.5, "sd": 0.01}} if scale else {}
-    numbers["axes"] = {"how": "cameras"}
+    numbers["axes"] = {"how": "cameras", "tilt_sd_deg": 0.5}
     return SimpleNamespace(
         scene=scene,
         tracks=tracks,

@@ -277,7 +277,7 @@ def test_a_camera_that_stands_still_has_one_pose(result):
     assert len(viewer_data(fixed)["cameras"][0]["frames"]) == 1
 
 
-def test_the_page_holds_what_the_viewer_shows(result, tmp_path):
+def test_the_page_holds_what_the_viewer_shows(result, tmp_path, monkeypatch):
     save_scene(result, tmp_path / "out", figures=NoFigures())
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     data, shown = data_of(page), viewer_data(result)
@@ -289,6 +289,9 @@ def test_the_page_holds_what_the_viewer_shows(result, tmp_path):
     assert "http" not in page.replace("http-equiv", "")
     assert "@" not in page.split("<script")[0].split("</style>")[1]
     assert 'class="green"' in page
+    monkeypatch.setitem(result.numbers["axes"], "tilt_sd_deg", None)  # what is up was guessed
+    save_scene(result, tmp_path / "guess", figures=NoFigures())
+    assert 'class="amber"' in (tmp_path / "guess" / "report.html").read_text(encoding="utf-8")
 
 
 def test_names_from_files_cannot_become_markup(tmp_path):
