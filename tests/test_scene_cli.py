@@ -191,7 +191,7 @@ def test_paths_in_the_scene_file_are_beside_it(tmp_path):
     assert found.rig == (("a", "b"), ("c", "d"))
 
 
-def test_what_a_recording_is_like_can_stand_in_the_scene_file(tmp_path, mine):
+def test_what_a_recording_is_like_can_stand_in_the_scene_file(tmp_path, mine, here):
     text = "pixel_origin: corner\nnoise_px: 1.5\ntime_offsets: true\nrig: off\n"
     (tmp_path / "scene.yaml").write_text(text)
     found = read_scene_settings(tmp_path)
