@@ -94,11 +94,6 @@ class PoseErrors:
     after_step: np.ndarray
 
 
-def pose_covariances(model: ColmapModel, min_observations: int = MIN_OBSERVATIONS) -> np.ndarray:
-    """Covariance of the pose of each image, (I, 6, 6): :attr:`PoseErrors.covariance`."""
-    return pose_errors(model, min_observations).covariance
-
-
 def pose_errors(model: ColmapModel, min_observations: int = MIN_OBSERVATIONS) -> PoseErrors:
     """How wrong the poses of a model are.
 

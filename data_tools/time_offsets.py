@@ -190,7 +190,7 @@ def keys_on_one_clock(
     step = max(1, round(min(steps))) if steps else 1
     moved = []
     for camera, path, shift in zip(cameras, paths, shifts, strict=True):
-        here = _path_at(path, *shift)
+        here = path_on_reference_clock(path, *shift)
         own = own_time(here.frame, *shift)
         place = np.clip(np.searchsorted(camera.frame, own), 1, max(len(camera.frame) - 1, 1))
         beside = camera.frame[np.stack([place - 1, np.minimum(place, len(camera.frame) - 1)])]
@@ -221,28 +221,6 @@ def _first_key(camera: KeyedCamera) -> dict[str, Any]:
     }
 
 
-def to_reference_clock(
-    tracks: Tracks2D, path: CameraPath, offset: float, drift: float = 0.0, middle: float = 0.0
-) -> tuple[Tracks2D, CameraPath]:
-    """Tracks and path of a camera in the whole frames of the reference's clock.
-
-    Both are interpolated between consecutive frames only: dots linearly within their track (nothing is
-    made up across gaps; bare points and dots that share frame and track with another belong to no line and
-    are kept at whole offsets only), centres linearly, rotations on the great arc. Each new dot has the row
-    and the animal of the nearer one.
-
-    Parameters
-    ----------
-    tracks : Tracks2D
-        On the camera's own clock.
-    path : CameraPath
-        On the camera's own clock.
-    offset, drift, middle : float
-        As in :class:`TimeOffsets`.
-    """
-    return tracks_on_reference_clock(tracks, offset, drift, middle), _path_at(path, offset, drift, middle)
-
-
 def _nodes(first: int, last: int, offset: float, drift: float, middle: float) -> tuple[np.ndarray, ...]:
     """Frames (M,) of the reference within a range of own frames, own frame before each, and the rest."""
     ends = np.array([first, last]) + offset + drift * (np.array([first, last]) - middle)
@@ -256,7 +234,19 @@ def _nodes(first: int, last: int, offset: float, drift: float, middle: float) ->
 def tracks_on_reference_clock(
     tracks: Tracks2D, offset: float, drift: float = 0.0, middle: float = 0.0
 ) -> Tracks2D:
-    """The tracks of :func:`to_reference_clock`."""
+    """Tracks of a camera in the whole frames of the reference's clock.
+
+    Dots are interpolated linearly between consecutive frames of their track; nothing is made up across gaps.
+    Bare points, and dots that share frame and track with another, belong to no line and are kept at whole
+    offsets only. Each new dot has the row and the animal of the nearer one.
+
+    Parameters
+    ----------
+    tracks : Tracks2D
+        On the camera's own clock.
+    offset, drift, middle : float
+        As in :class:`TimeOffsets`.
+    """
     if not len(tracks):
         return tracks
     frame, before, part = _nodes(int(tracks.frame.min()), int(tracks.frame.max()), offset, drift, middle)
@@ -299,7 +289,25 @@ def _loose_at_whole(tracks: Tracks2D, frame: np.ndarray, own: np.ndarray) -> tup
     return loose[found], frame[place[found]]
 
 
-def _path_at(path: CameraPath, offset: float, drift: float, middle: float) -> CameraPath:
+def path_on_reference_clock(
+    path: CameraPath, offset: float, drift: float = 0.0, middle: float = 0.0
+) -> CameraPath:
+    """A camera's path in the whole frames of the reference's clock.
+
+    Between consecutive frames centres go straight, and rotations on the great arc.
+
+    Parameters
+    ----------
+    path : CameraPath
+        On the camera's own clock.
+    offset, drift, middle : float
+        As in :class:`TimeOffsets`.
+
+    Raises
+    ------
+    InputError
+        No whole frame of the reference falls on the path.
+    """
     first, last = int(path.frame[0]), int(path.frame[-1])
     frame, before, part = _nodes(first, last, offset, drift, middle)
     if not len(frame):

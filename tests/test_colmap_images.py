@@ -16,7 +16,6 @@ from acino_fte.cameras import Camera
 from acino_fte.data_tools.colmap import ColmapModel, read_colmap
 from acino_fte.data_tools.colmap_covariance import (
     mended,
-    pose_covariances,
     pose_errors,
     pose_slope,
     residual_noise,
@@ -317,9 +316,9 @@ def test_covariances_move_with_the_world():
     change = Similarity(2.5, Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix(), np.array([3.0, -2.0, 7.0]))
     rotation, translation = change.poses(m.rotation, m.translation)
     other = replace(m, rotation=rotation, translation=translation, cloud=m.cloud.moved(change))
-    expected = change.pose_covariance(pose_covariances(m))
+    expected = change.pose_covariance(pose_errors(m).covariance)
     scale = np.sqrt(np.einsum("nii->ni", expected))
-    got = pose_covariances(other) / scale[:, :, None] / scale[:, None]
+    got = pose_errors(other).covariance / scale[:, :, None] / scale[:, None]
     np.testing.assert_allclose(got, expected / scale[:, :, None] / scale[:, None], rtol=0, atol=1e-7)
 
 
@@ -331,9 +330,9 @@ def test_images_whose_observations_do_not_fix_the_pose():
     xy = np.where(line[:, None], m.observed_xy[line][0], m.observed_xy)
     m = replace(m, observed_point=point, observed_xy=xy)
     m = replace(m, **{k: getattr(m, k)[~few] for k in ("observed_image", "observed_point", "observed_xy")})
-    known = np.isfinite(pose_covariances(m)).all(axis=(1, 2))
+    known = np.isfinite(pose_errors(m).covariance).all(axis=(1, 2))
     np.testing.assert_array_equal(np.flatnonzero(~known), [3, 6])
-    values = np.linalg.eigvalsh(pose_covariances(m)[known])
+    values = np.linalg.eigvalsh(pose_errors(m).covariance[known])
     assert (values > 0).all()
 
 
@@ -344,7 +343,7 @@ def test_models_without_observations():
     assert result.covariance.shape == (4, 6, 6) and np.isnan(result.covariance).all()
     assert np.isnan(result.noise_px)
     scarce = {key: getattr(m, key)[:20] for key in none}  # fewer numbers than freedoms
-    assert np.isnan(pose_covariances(replace(m, **scarce))).all()
+    assert np.isnan(pose_errors(replace(m, **scarce)).covariance).all()
 
 
 def test_models_without_noise():
@@ -354,7 +353,7 @@ def test_models_without_noise():
     assert result.adjusted and result.noise_px < 1e-9
     assert (np.diagonal(result.covariance, axis1=1, axis2=2) < 1e-20).all()
     exact = replace(m, observed_xy=m.observed_xy - residuals(m))
-    assert np.isfinite(pose_covariances(exact)).all()
+    assert np.isfinite(pose_errors(exact).covariance).all()
 
 
 @pytest.mark.parametrize("folder", RIGS, ids=lambda p: p.name)

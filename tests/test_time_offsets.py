@@ -14,7 +14,8 @@ from acino_fte.data_tools.time_offsets import (
     estimate_time_offsets,
     keys_on_one_clock,
     own_time,
-    to_reference_clock,
+    path_on_reference_clock,
+    tracks_on_reference_clock,
 )
 from acino_fte.data_tools.tracks2d import Tracks2D
 from acino_fte.errors import InputError
@@ -197,7 +198,8 @@ def test_dots_and_poses_on_the_reference_clock_are_those_of_that_time():
     seen = (frame != 40) & (frame != 41)
     order = np.random.default_rng(0).permutation(np.flatnonzero(seen))
     tracks = Tracks2D("a", frame[order], np.zeros(len(order), int), xy[order], ("one",), animal=order % 3)
-    found, moved = to_reference_clock(tracks, path, offset, drift, middle)
+    found = tracks_on_reference_clock(tracks, offset, drift, middle)
+    moved = path_on_reference_clock(path, offset, drift, middle)
     np.testing.assert_allclose(found.xy, np.stack([3 * found.frame, 100 - found.frame], -1), atol=1e-9)
     own = own_time(found.frame, offset, drift, middle)
     gap = (own > 39) & (own < 42)
@@ -250,7 +252,7 @@ def test_a_whole_offset_only_renames_the_frames():
     track = np.where(np.arange(len(view)) % 5, view.track, -1)  # some bare points
     doubled = np.concatenate([np.arange(len(view)), [3, 3]])
     view = Tracks2D("c1", view.frame[doubled], track[doubled], view.xy[doubled], view.labels)
-    found, path = to_reference_clock(view, paths[1], -4.0)
+    found, path = tracks_on_reference_clock(view, -4.0), path_on_reference_clock(paths[1], -4.0)
     order = np.lexsort((view.row, view.track, view.frame))
     back = np.lexsort((found.row, found.track, found.frame))
     np.testing.assert_array_equal(found.frame[back] + 4, view.frame[order])
@@ -265,10 +267,8 @@ def test_clocks_that_were_set_right_leave_nothing():
     offset = np.array([0.0, 8.4, -5.7])
     paths, tracks, lenses = record(offset, n=800, swapped=0.0)
     clocks = estimate_time_offsets(paths, tracks, lenses, reference="c0", drift=False)
-    moved = [
-        to_reference_clock(view, path, *values)
-        for view, path, *values in zip(tracks, paths, clocks.offset, clocks.drift, strict=True)
-    ]
-    views, ways = zip(*moved, strict=True)
+    shifts = list(zip(clocks.offset, clocks.drift, strict=True))
+    views = [tracks_on_reference_clock(view, *shift) for view, shift in zip(tracks, shifts, strict=True)]
+    ways = [path_on_reference_clock(path, *shift) for path, shift in zip(paths, shifts, strict=True)]
     again = estimate_time_offsets(ways, views, lenses, reference="c0", drift=False)
     np.testing.assert_allclose(again.offset, 0, atol=0.02)
