@@ -103,6 +103,14 @@ class PointInformation:
         common = max(1.0 - own, 0.0) if self._attached else 0.0
         return SceneNoise(float(np.sqrt(variance)), own, common)
 
+    def expected_variance(self, noise: SceneNoise) -> np.ndarray:
+        """Expected square of a residual per degree of freedom of each point, (T,), px²; NaN without any."""
+        out = np.full(len(self._position), np.nan)
+        free = self._freedom > 0
+        from_poses = self._from_poses()[free] / self._freedom[free]
+        out[self._there[free]] = noise.px**2 + noise.own * from_poses
+        return out
+
     def _from_poses(self) -> np.ndarray:
         """tr(P_⊥ Σ_g J_g M_g J_gᵀ) of points, px²."""
         whole = self._information.sum(0)

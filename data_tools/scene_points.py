@@ -4,7 +4,8 @@ Without outliers the steps are: the point nearest to all rays; two Gauss–Newto
 error; and one more with the weights that the errors of the poses demand (:mod:`scene_noise`). Points whose
 dots contradict each other are decided by consensus: every pair of views proposes a point, the one with the
 smallest truncated cost (MSAC: Torr and Zisserman 2000) tells which dots are wrong; where two views alone
-contradict each other nothing is decided. Shapes: P dots, T points.
+contradict each other nothing is decided. Without a rig, dots may disagree as much as the errors of their poses
+let expect. Shapes: P dots, T points.
 """
 
 from __future__ import annotations
@@ -71,11 +72,15 @@ def triangulate_points(rows: SceneRows, views: Views, noise_px: float | None = N
         The points.
     """
     used = np.bincount(rows.point, minlength=rows.n_points)[rows.point] >= 2
-    position = refine(rows, nearest_points(rows, used), used)
-    total = max(_typical(rows, position, used), (noise_px or 0.0) ** 2)
-    used, position = _consensus(rows, position, used, total)
+    first, every = refine(rows, nearest_points(rows, used), used), used
+    total = np.full(rows.n_points, max(_typical(rows, first, every), (noise_px or 0.0) ** 2))
+    used, position = _consensus(rows, first, every, total)
     information = PointInformation(rows, views, position, used)
     noise = information.estimate_noise(noise_px)
+    if len(views.bases) > 1:  # poses err more between key frames, and dots may disagree more there
+        expected = PointInformation(rows, views, first, every).expected_variance(noise)
+        used, position = _consensus(rows, first, every, np.fmax(total, expected))
+        information = PointInformation(rows, views, position, used)
     position, covariance = information.solve(noise)
     return PointFit(position, covariance, used & np.isfinite(position[rows.point, 0]), noise)
 
@@ -168,21 +173,25 @@ def _limit(freedom: np.ndarray) -> np.ndarray:
 
 
 def _consensus(
-    rows: SceneRows, position: np.ndarray, used: np.ndarray, variance: float
+    rows: SceneRows, position: np.ndarray, used: np.ndarray, variance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Dots (P,) that count, and points, after every contradiction was decided or given up."""
+    """Dots (P,) that count, and points, after every contradiction was decided or given up.
+
+    `variance` (T,) is that of a residual coordinate of each point, px².
+    """
     misfit, freedom = _misfit(rows, position, used)
     with np.errstate(invalid="ignore"):
         doubtful = (freedom > 0) & ~(misfit <= variance * _limit(freedom))
     if not doubtful.any():
         return used, position
     some, dots = rows.of_points(doubtful)
+    variance = variance[doubtful]
     right = np.zeros(len(dots), dtype=bool)
     count = np.bincount(some.point, minlength=some.n_points)
     order = np.argsort(some.point, kind="stable")
     for n in np.unique(count[count > 2]):
         block = order[np.repeat(count == n, count)].reshape(-1, n)
-        right[block] = _vote(some, block, variance)
+        right[block] = _vote(some, block, variance[some.point[block[:, 0]], None])
     right &= np.bincount(some.point[right], minlength=some.n_points)[some.point] >= 2
     found = refine(some, nearest_points(some, right), right)
     found[~_agreed(some, found, right, variance)] = np.nan
@@ -192,20 +201,20 @@ def _consensus(
     return used, position
 
 
-def _agreed(rows: SceneRows, position: np.ndarray, used: np.ndarray, variance: float) -> np.ndarray:
+def _agreed(rows: SceneRows, position: np.ndarray, used: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Points (T,) that each of their dots is near; two views alone have to meet.
 
     A point that all views see somewhat worse than others is still a point.
     """
     misfit, freedom = _misfit(rows, position, used)
     residual, _ = rows.measured.linearise(position)
-    far = used & ~((residual**2).sum(1) < _GATE * variance)
+    far = used & ~((residual**2).sum(1) < _GATE * variance[rows.point])
     near = np.bincount(rows.point[far], minlength=rows.n_points) == 0
     with np.errstate(invalid="ignore"):
         return np.where(freedom > 1, near, misfit <= variance * _limit(freedom)) & np.isfinite(misfit)
 
 
-def _vote(rows: SceneRows, block: np.ndarray, variance: float) -> np.ndarray:
+def _vote(rows: SceneRows, block: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Dots (K, n) of K points with n views each that agree with the best pair's proposal."""
     k, n = block.shape
     pairs = [(i, j) for i in range(n) for j in range(i)]
