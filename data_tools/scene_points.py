@@ -4,8 +4,8 @@ Without outliers the steps are: the point nearest to all rays; two Gauss–Newto
 error; and one more with the weights that the errors of the poses demand (:mod:`scene_noise`). Points whose
 dots contradict each other are decided by consensus: every pair of views proposes a point, the one with the
 smallest truncated cost (MSAC: Torr and Zisserman 2000) tells which dots are wrong; where two views alone
-contradict each other nothing is decided. Without a rig, dots may disagree as much as the errors of their poses
-let expect. Shapes: P dots, T points.
+contradict each other nothing is decided. Without a rig, dots may disagree as much as the errors of their
+poses let expect. Shapes: P dots, T points.
 """
 
 from __future__ import annotations
