@@ -1,7 +1,7 @@
 """What recordings of a rig hold, whatever file they come from: lidar returns, inertial samples, pictures.
 
-A reader walks through a file once and yields records in the order of the file, in constant memory. Of a cut or
-damaged file it yields every whole record before and after the damage, and counts what was lost.
+A reader walks through a file once and yields records in the order of the file, in constant memory. Of a cut
+or damaged file it yields every whole record before and after the damage, and counts what was lost.
 Times are int64 nanoseconds: ``time_ns`` by the clock of the sensor, ``received_ns`` by that of the computer.
 """
 
@@ -127,7 +127,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Stream:
-    """One stream of a recording: name (a topic, or ``lidar0``), kind, message type, and count if it is told."""
+    """One stream of a recording: name (a topic, or ``lidar0``), kind, message type, and count if known."""
 
     name: str
     kind: Kind
