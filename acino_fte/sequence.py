@@ -9,6 +9,7 @@ import numpy as np
 
 from acino_fte.cameras import CameraArray
 from acino_fte.errors import InputError
+from acino_fte.lidar import Lidar
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -43,6 +44,8 @@ class Sequence:
         and ``marker_offset_m`` as :attr:`acino_fte.simulate.Simulation.parameters` has them, and ``swapped``,
         a list of [frame, camera, [marker, …]] where left and right are exchanged, with frames counted from
         the start of the recording. Empty when nothing is known.
+    lidar : Lidar, optional
+        Returns of a lidar that is calibrated to one of the cameras.
     provenance : dict
         The sequence as it was understood, ready to be written as ``sequence.yaml``.
     warnings : tuple of str
@@ -57,6 +60,7 @@ class Sequence:
     truth: xr.DataArray | None = None
     ground: tuple[float, float, float, float] | None = None
     truth_parameters: dict[str, Any] = field(default_factory=dict)
+    lidar: Lidar | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
@@ -67,6 +71,13 @@ class Sequence:
                 "Cameras and detections do not belong together.",
                 expected=f"cameras {', '.join(self.cameras.names)}",
                 found=", ".join(found),
+            )
+        if self.lidar is not None and self.lidar.camera not in found:
+            raise InputError(
+                "The lidar is calibrated to a camera that the sequence does not have.",
+                key="lidar.camera",
+                expected=f"one of {', '.join(found)}",
+                found=self.lidar.camera,
             )
 
     @property
