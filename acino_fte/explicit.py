@@ -7,6 +7,7 @@ Variables, indexed by frame number, ``link.dof``, marker and camera name:
     parameter[name]                   global parameters, by name: 'delay.cam2', 'scale.neck', …
     slack_model[frame, dof, 'w']      jump of acceleration
     slack_meas[frame, marker, camera, 'u' | 'v']      reprojection residual, px
+    slack_depth[frame, marker, camera, 'd']           depth residual, m
     slack_<family>[…]                 residuals of any other term
 
 Constraints: ``kinematics`` (position = p(x)), ``velocity`` and ``acceleration`` (backward Euler), and
@@ -237,7 +238,8 @@ def _instances(
         data = [term.data[name] for name in term.residual.data]
         inputs += [problem.dt, *(float(v[k]) if isinstance(v, np.ndarray) else v for v in data)]
         labels = [sets.get(kinds[i], model.DOFS).at(int(items[i]) + 1) for i in named]
-        key = (frames[n], *labels, *([term.label] if term.label else []))
+        number = [] if term.numbers is None else [int(term.numbers[k])]
+        key = (frames[n], *labels, *([term.label] if term.label else []), *number)
         yield key, dict(zip(names, inputs, strict=True))
 
 

@@ -65,6 +65,9 @@ _KINDS: dict[str, tuple[Kind, ...]] = {
     "marker_offset_m": (
         Kind("Shift of the marker in its link", "Shift", "marker_offset", "m", "mm", 1e3, 1, "keypoints"),
     ),
+    "surface_offset_m": (
+        Kind("Surface before the marker", "Distance", "surface_offset", "m", "mm", 1e3, 1, "keypoints"),
+    ),
     "noise_px": (Kind("Detection noise, sd", "Noise", "noise", "px", "px", 1.0, 2, "keypoints"),),
 }
 _SUFFIXES = {"_s": "s", "_m": "m", "_px": "px", "_rad": "rad", "_hz": "Hz"}

@@ -8,10 +8,13 @@ offsets      displacement of every marker in its link's frame, m          0.03 m
 delay        time offset τ of every camera but the first, s               half a frame
 extrinsics   turn ρ and shift d of every camera but the first:            0.5°, 0.1 m
              x_camera = Cayley(ρ)·(R x + t) + d
+surface      how far the body's surface lies before every marker, as     see :mod:`depth`
+             a lidar beside the camera sees it; always with a lidar
 ===========  ===========================================================  ==========================
 
-All priors are Gaussian about zero (the species file, and the calibration as given) and all parameters are
-bounded. The first camera stays as it is: it fixes the origin of time and the frame of the world.
+All priors are Gaussian about zero (the species file, and the calibration as given; a surface counts from
+what is expected of it) and all parameters are bounded. The first camera stays as it is: it fixes the origin
+of time and the frame of the world.
 """
 
 from __future__ import annotations
@@ -32,14 +35,15 @@ if TYPE_CHECKING:
 FAMILIES = ("scale", "offsets", "delay", "extrinsics")
 KINEMATIC = ("scale", "offsets")
 POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
-_UNITS = {"scale": "log", "offsets": "m", "delay": "s", "extrinsics": "rad"}
+_UNITS = {"scale": "log", "offsets": "m", "delay": "s", "extrinsics": "rad", "surface": "m"}
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One global parameter: family, whose it is, which component; Gaussian prior about zero, and bound.
 
-    ``sd`` and ``bound`` (|value| ≤ bound) are in the parameter's unit: log, m, s or rad.
+    ``sd`` and ``bound`` (|value| ≤ bound) are in the parameter's unit: log, m, s or rad. ``origin`` is what
+    the value zero stands for.
     """
 
     family: str
@@ -47,6 +51,7 @@ class Parameter:
     component: str
     sd: float
     bound: float
+    origin: float = 0.0
 
     @property
     def name(self) -> str:
@@ -162,6 +167,15 @@ def declare(
     return Parameters(tuple(entries))
 
 
+def with_surface(parameters: Parameters, markers: list[str], mean: np.ndarray, sd: np.ndarray) -> Parameters:
+    """The same with one distance of the surface for each marker: prior mean and sd (M,), m."""
+    entries = [
+        Parameter("surface", marker, "", float(s), _REACH * float(s), float(m))
+        for marker, m, s in zip(markers, mean, sd, strict=True)
+    ]
+    return Parameters((*parameters.entries, *entries))
+
+
 def check_families(families: Iterable[str]) -> tuple[str, ...]:
     """Families in their order, none twice.
 
@@ -208,7 +222,7 @@ def describe(
             continue
         zero = _ZEROS.get(family) if reference else None
         first = {} if zero is None else {str(reference): zero}
-        result[name] = {**first, **_table(parameters, family, theta)}
+        result[name] = {**first, **_table(parameters, family, theta, absolute=True)}
         if family == "scale":
             result[name] = {group: math.exp(value) for group, value in result[name].items()}
         elif family == "extrinsics":
@@ -223,12 +237,15 @@ def describe(
     return result
 
 
-def _table(parameters: Parameters, family: str, values: np.ndarray) -> dict[str, Any]:
+def _table(
+    parameters: Parameters, family: str, values: np.ndarray, *, absolute: bool = False
+) -> dict[str, Any]:
     """Values of a family by owner: a number, three of them, or a pose."""
     table: dict[str, Any] = {}
     for parameter, value in zip(parameters.entries, values.tolist(), strict=True):
         if parameter.family != family:
             continue
+        value += parameter.origin if absolute else 0.0
         if family == "offsets":
             table.setdefault(parameter.owner, []).append(value)
         elif family == "extrinsics":
@@ -244,6 +261,7 @@ FAMILY_KEYS = {
     "marker_offset_m": "offsets",
     "time_offset_s": "delay",
     "extrinsics": "extrinsics",
+    "surface_offset_m": "surface",
 }
 _ZEROS: dict[str, Any] = {
     "delay": 0.0,

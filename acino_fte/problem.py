@@ -3,11 +3,12 @@
 Minimise over q (N, Q) and the global parameters θ (:mod:`acino_fte.parameters`), within their bounds, the
 negative log-posterior
 
-    Σ_frames,cameras,markers ρ(|π(p(q, θ)) − z|/σ_px)  +  ½ Σ (w/σ_w)²  +  ½ Σ ((q − mean)/σ_prior)²
-        +  ½ Σ (θ/σ_θ)²,
+    Σ_frames,cameras,markers ρ(|π(p(q, θ)) − z|/σ_px)  +  Σ_frames,markers ρ(|d|/σ_m)
+        +  ½ Σ (w/σ_w)²  +  ½ Σ ((q − mean)/σ_prior)²  +  ½ Σ (θ/σ_θ)²,
 
-with w the jump of acceleration from frame to frame (Joska et al. 2021, eq. 4–9, with the ½ of a Gaussian
-likelihood, so that the curvature at the optimum is an information matrix).
+with d the depth residual where there is a lidar (:mod:`acino_fte.depth`) and w the jump of acceleration from
+frame to frame (Joska et al. 2021, eq. 4–9, with the ½ of a Gaussian likelihood, so that the curvature at the
+optimum is an information matrix).
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from typing import Any
 import numpy as np
 
 from acino_fte import delay
+from acino_fte.depth import DepthData, depth_terms, surface_prior
 from acino_fte.errors import InputError
 from acino_fte.kinematics import Kinematics
 from acino_fte.losses import Loss
-from acino_fte.parameters import KINEMATIC, Parameters, PriorWidths, check_families, declare
+from acino_fte.parameters import KINEMATIC, Parameters, PriorWidths, check_families, declare, with_surface
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton
 from acino_fte.terms import Term, measurement_term, model_term, parameter_term, prior_term, size_terms
@@ -85,11 +87,14 @@ class Assumptions:
         Standard deviation of every marker's detections, px.
     noise_factors : (Q,), optional
         Factor on the process noise of every degree of freedom.
+    depth : DepthData, optional
+        What a lidar says, attached to the skeleton (:mod:`acino_fte.association`); None leaves it out.
     """
 
     pixels: np.ndarray | None = None
     sd_px: np.ndarray | None = None
     noise_factors: np.ndarray | None = None
+    depth: DepthData | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +209,8 @@ def build_fte(
     if sd is None:
         sd = np.array([m.sd_px for m in skeleton.markers])
     parameters = _parameters(sequence, skeleton, options)
+    if assumed.depth is not None and assumed.depth.surface:
+        parameters = with_surface(parameters, skeleton.marker_names, *surface_prior(skeleton))
     terms = [
         measurement_term(camera, pixels[:, c], sd, options.loss, sequence.n_frames, parameters)
         for c, camera in enumerate(sequence.cameras)
@@ -215,6 +222,9 @@ def build_fte(
             key="likelihood",
             remedy="lower --likelihood, or choose frames in which the animal is seen",
         )
+    if assumed.depth is not None:
+        camera = sequence.cameras[assumed.depth.camera]
+        present += depth_terms(assumed.depth, camera, sequence.n_frames, parameters)
     if {"scale", "extrinsics"} <= set(parameters.families):
         present += size_terms(parameters, sequence.cameras, options.widths.size)
     factors = 1.0 if assumed.noise_factors is None else assumed.noise_factors

@@ -49,6 +49,8 @@ class Term:
     loss : Loss
     label : str, optional
         What the instances have in common beside the family: the camera's name.
+    numbers : (K,) int, optional
+        Tells instances apart that have frame and items in common, such as returns on one link.
     """
 
     family: str
@@ -59,6 +61,7 @@ class Term:
     sd: np.ndarray
     loss: Loss = field(default_factory=lambda: Loss("squared"))
     label: str = ""
+    numbers: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -66,11 +69,19 @@ class Term:
     def select(self, keep: np.ndarray) -> Term:
         """The instances for which ``keep`` (K,) bool is true."""
         data = {k: v[keep] if isinstance(v, np.ndarray) else v for k, v in self.data.items()}
-        return replace(self, frames=self.frames[keep], items=self.items[keep], data=data, sd=self.sd[keep])
+        return replace(
+            self,
+            frames=self.frames[keep],
+            items=self.items[keep],
+            data=data,
+            sd=self.sd[keep],
+            numbers=None if self.numbers is None else self.numbers[keep],
+        )
 
 
 _NONE = Parameters()
-_POSE = tuple(f"r{i}{j}" for i in range(3) for j in range(3)) + ("tx", "ty", "tz")
+POSE_NAMES = tuple(f"r{i}{j}" for i in range(3) for j in range(3)) + ("tx", "ty", "tz")
+"""Names of a camera's pose, world to camera, in a residual's data."""
 
 
 @cache
@@ -83,17 +94,13 @@ def measurement_residual(model: str, *, moved: bool = False, delayed: bool = Fal
     """
 
     def derive(handles: list[Any], data: dict[str, sp.Symbol], let: Let) -> Derived:
-        p = handles[0]
-        local = [
-            let(f"local_{AXES[i]}", sum(data[f"r{i}{j}"] * p[j] for j in range(3)) + data[f"t{AXES[i]}"])
-            for i in range(3)
-        ]
+        local = in_camera(handles[0], data, let)
         if moved:
-            local = _moved(local, handles[1:4], handles[4:7], let)
+            local = moved_in_camera(local, handles[1:4], handles[4:7], let)
         u, v = projection.project(model, (local[0], local[1], local[2]))
         return [u - data["u"], v - data["v"]], [local[2]]
 
-    data = ("u", "v", *_POSE, *projection.parameter_names(model))
+    data = ("u", "v", *POSE_NAMES, *projection.parameter_names(model))
     sources = (Path(__file__), Path(projection.__file__))
     handles = [Handle("position", delay=1 if delayed else None)]
     if moved:
@@ -102,7 +109,15 @@ def measurement_residual(model: str, *, moved: bool = False, delayed: bool = Fal
     return Residual(name, tuple(handles), data, ("u", "v"), "px", derive, sources)
 
 
-def _moved(local: list[Any], rho: list[Any], shift: list[Any], let: Let) -> list[Any]:
+def in_camera(p: tuple[Any, ...], data: dict[str, sp.Symbol], let: Let) -> list[Any]:
+    """R p + t with the camera's pose in the residual's data."""
+    return [
+        let(f"local_{AXES[i]}", sum(data[f"r{i}{j}"] * p[j] for j in range(3)) + data[f"t{AXES[i]}"])
+        for i in range(3)
+    ]
+
+
+def moved_in_camera(local: list[Any], rho: list[Any], shift: list[Any], let: Let) -> list[Any]:
     """A point in the camera's frame after the camera's correction."""
 
     def cross(a: list[Any], b: list[Any]) -> list[Any]:
@@ -157,13 +172,7 @@ def measurement_term(
         "u": pixels[frames, markers, 0],
         "v": pixels[frames, markers, 1],
     }
-    rotation, translation = camera.rotation, camera.translation
-    if camera.moves:
-        rotation = np.moveaxis(np.broadcast_to(rotation, (n_frames, 3, 3))[frames], 0, -1)
-        translation = np.moveaxis(np.broadcast_to(translation, (n_frames, 3))[frames], 0, -1)
-    for i in range(3):
-        data[f"t{AXES[i]}"] = translation[i]
-        data |= {f"r{i}{j}": rotation[i, j] for j in range(3)}
+    data |= pose_data(camera, frames, n_frames)
     names = projection.parameter_names(camera.model)
     data |= dict(zip(names, camera.parameters.tolist(), strict=True))
     delay = parameters.place("delay", camera.name)
@@ -174,6 +183,16 @@ def measurement_term(
     items = np.empty((len(frames), 1 + len(columns)), dtype=int)
     items[:, 0], items[:, 1:] = markers, columns
     return Term("meas", residual, frames, items, data, sd_px[markers], loss, camera.name)
+
+
+def pose_data(camera: Camera, frames: np.ndarray, n_frames: int) -> dict[str, float | np.ndarray]:
+    """Numbers for :data:`POSE_NAMES`: of every instance (K,) of a moving camera, one each of a fixed one."""
+    rotation, translation = camera.rotation, camera.translation
+    if camera.moves:
+        rotation = np.moveaxis(np.broadcast_to(rotation, (n_frames, 3, 3))[frames], 0, -1)
+        translation = np.moveaxis(np.broadcast_to(translation, (n_frames, 3))[frames], 0, -1)
+    data: dict[str, float | np.ndarray] = {f"t{a}": translation[i] for i, a in enumerate(AXES)}
+    return data | {f"r{i}{j}": rotation[i, j] for i in range(3) for j in range(3)}
 
 
 def model_term(skeleton: Skeleton, n_frames: int, fps: float) -> Term:

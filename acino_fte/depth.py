@@ -1,0 +1,256 @@
+"""Depth from a lidar: what its returns say of the skeleton, and the terms that they become.
+
+A lidar sees the body's surface, which lies before the joints. With z the third row of a camera's x = R p + t,
+s_m the distance of the surface before marker m along the line of sight, and z̃ the depth of the surface at the
+marker, the depth residual is (the thesis's e_depth, whose surface is the joint: s = 0)
+
+    d = z(p_m) − s_m − z̃.
+
+When the whole body is asked for, every return x̃ on it counts as a distance to a capsule around the link
+between two markers a, b,
+
+    d = |R ((1 − u) p_a + u p_b) + t − x̃| − ((1 − u) s_a + u s_b),
+
+with 0 ≤ u ≤ 1 held where the return was attached. The surface s has a Gaussian prior about what the body's
+capsules, or a limb's usual thickness, let expect. Which return belongs to what is decided by
+:mod:`acino_fte.association`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acino_fte.cameras import Camera
+from acino_fte.losses import Loss
+from acino_fte.parameters import POSE, Parameters
+from acino_fte.residuals import AXES, Derived, Handle, Let, Residual
+from acino_fte.terms import Term, in_camera, moved_in_camera, pose_data
+
+if TYPE_CHECKING:
+    import sympy as sp
+
+    from acino_fte.skeleton import Skeleton
+
+LIMB = 0.03
+"""How far the surface lies before a joint of a limb, m, and the standard deviation of that."""
+_SHARE = 0.5  # standard deviation of a surface that the species' capsules tell, as a share of their radius
+_HERE = (Path(__file__),)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerDepths:
+    """Depths of the surface at markers. K measurements, at most one of a marker in a frame.
+
+    Attributes
+    ----------
+    frame, marker : (K,) int
+        Frames are indices into the sequence.
+    depth : (K,)
+        z of the surface in the camera's frame, m.
+    sd : (K,)
+        m.
+    count : (K,) int
+        How many returns are in it.
+    """
+
+    frame: np.ndarray
+    marker: np.ndarray
+    depth: np.ndarray
+    sd: np.ndarray
+    count: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, eq=False)
+class BodyReturns:
+    """Returns on the body, each attached to a link. K returns.
+
+    Attributes
+    ----------
+    frame : (K,) int
+        Index into the sequence.
+    start, end : (K,) int
+        Markers at the ends of the link.
+    along : (K,)
+        u: where on the link, 0 at `start` to 1 at `end`.
+    xyz : (K, 3)
+        m, the camera's frame, moved to the time of the frame.
+    sd : (K,)
+        m.
+    """
+
+    frame: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+    along: np.ndarray
+    xyz: np.ndarray
+    sd: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, eq=False)
+class DepthData:
+    """What a lidar says of the skeleton, for the problem.
+
+    Attributes
+    ----------
+    camera : str
+        The camera whose frame it is in.
+    measured : MarkerDepths or BodyReturns
+    surface : bool
+        Whether the surface lies before the joints, by distances to be estimated.
+    loss : Loss
+    """
+
+    camera: str
+    measured: MarkerDepths | BodyReturns
+    surface: bool = True
+    loss: Loss = field(default_factory=lambda: Loss("geman_mcclure"))
+
+
+def surface_prior(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
+    """Expected distance of the surface before every marker (M,), m, and its standard deviation (M,), m.
+
+    The radius of the species' widest capsule that ends there, else :data:`LIMB`.
+    """
+    mean = np.zeros(len(skeleton.markers))
+    for a, b, radius in skeleton.capsules:
+        mean[[a, b]] = np.maximum(mean[[a, b]], radius)
+    mean = np.where(mean > 0, mean, LIMB)
+    return mean, np.maximum(_SHARE * mean, LIMB)
+
+
+def depth_terms(data: DepthData, camera: Camera, n_frames: int, parameters: Parameters) -> list[Term]:
+    """The terms of some depth data; none when it is empty.
+
+    ``parameters`` have the surface's family where ``data.surface``; a camera that is itself estimated takes
+    its lidar along.
+    """
+    if not len(data.measured):
+        return []
+    if isinstance(data.measured, MarkerDepths):
+        return [_marker_term(data, data.measured, camera, n_frames, parameters)]
+    return [_body_term(data, data.measured, camera, n_frames, parameters)]
+
+
+def _marker_term(
+    data: DepthData, found: MarkerDepths, camera: Camera, n_frames: int, parameters: Parameters
+) -> Term:
+    pose, late = _camera_places(camera, parameters)
+    surface = parameters.of_family("surface") if data.surface else np.empty(0, dtype=int)
+    columns = ([late] if late is not None else []) + pose
+    items = np.empty((len(found), 1 + len(columns) + (1 if len(surface) else 0)), dtype=int)
+    items[:, 0], items[:, 1 : 1 + len(columns)] = found.marker, columns
+    origin = np.zeros(len(found))
+    if len(surface):
+        items[:, -1] = surface[found.marker]
+        origin = _origins(parameters)[items[:, -1]]
+    values = {"depth": found.depth, "origin": origin, **pose_data(camera, found.frame, n_frames)}
+    residual = depth_residual(moved=bool(pose), delayed=late is not None, surface=len(surface) > 0)
+    return Term("depth", residual, found.frame, items, values, found.sd, data.loss, camera.name)
+
+
+def _body_term(
+    data: DepthData, found: BodyReturns, camera: Camera, n_frames: int, parameters: Parameters
+) -> Term:
+    pose, _ = _camera_places(camera, parameters)
+    surface = parameters.of_family("surface")
+    items = np.empty((len(found), 4 + len(pose)), dtype=int)
+    items[:, 0], items[:, 1] = found.start, found.end
+    items[:, 2], items[:, 3] = surface[found.start], surface[found.end]
+    items[:, 4:] = pose
+    origins, u = _origins(parameters), found.along
+    values = {
+        "along": u,
+        "origin": (1 - u) * origins[items[:, 2]] + u * origins[items[:, 3]],
+        **{f"at_{a}": found.xyz[:, i] for i, a in enumerate(AXES)},
+        **pose_data(camera, found.frame, n_frames),
+    }
+    numbers = np.arange(len(found))
+    return Term(
+        "depth", body_residual(moved=bool(pose)), found.frame, items, values, found.sd, data.loss,
+        camera.name, numbers,
+    )  # fmt: skip
+
+
+def _camera_places(camera: Camera, parameters: Parameters) -> tuple[list[int], int | None]:
+    """Places in θ of a camera's correction (empty when it has none) and of its time offset."""
+    pose = [parameters.place("extrinsics", camera.name, component) for component in POSE]
+    return [p for p in pose if p is not None], parameters.place("delay", camera.name)
+
+
+def _origins(parameters: Parameters) -> np.ndarray:
+    return np.array([p.origin for p in parameters.entries])
+
+
+@cache
+def depth_residual(*, moved: bool = False, delayed: bool = False, surface: bool = True) -> Residual:
+    """z(p) − (origin + s) − depth, m.
+
+    Items: the marker; the time offset, when ``delayed``; the six parameters of the camera's correction, when
+    ``moved``; the marker's surface, when ``surface``.
+    """
+
+    def derive(handles: list[Any], data: dict[str, sp.Symbol], let: Let) -> Derived:
+        local = in_camera(handles[0], data, let)
+        if moved:
+            local = moved_in_camera(local, handles[1:4], handles[4:7], let)
+        return [local[2] - data["origin"] - (handles[-1] if surface else 0) - data["depth"]], []
+
+    count = 1 + delayed
+    handles = [Handle("position", delay=1 if delayed else None)]
+    handles += [Handle("parameter", item=count + k) for k in range(6 * moved + surface)]
+    name = "-".join(["depth"] + ["moved"] * moved + ["delayed"] * delayed + ["surface"] * surface)
+    data = ("depth", "origin", *pose_names())
+    return Residual(name, tuple(handles), data, ("d",), "m", derive, _sources())
+
+
+@cache
+def body_residual(*, moved: bool = False) -> Residual:
+    """Distance of a return to the capsule around a link, m: |x_link(u) − x̃| − (origin + (1 − u) s_a + u s_b).
+
+    Items: the two markers, their two surfaces, then the camera's correction, when ``moved``.
+    """
+
+    def derive(handles: list[Any], data: dict[str, sp.Symbol], let: Let) -> Derived:
+        import sympy as sp
+
+        u = data["along"]
+        on_link = tuple(
+            let(f"link_{a}", (1 - u) * p + u * q)
+            for a, p, q in zip(AXES, handles[0], handles[1], strict=True)
+        )
+        local = in_camera(on_link, data, let)
+        if moved:
+            local = moved_in_camera(local, handles[4:7], handles[7:10], let)
+        gap = [let(f"gap_{a}", x - data[f"at_{a}"]) for a, x in zip(AXES, local, strict=True)]
+        distance = let("distance", sp.sqrt(sum(g * g for g in gap)))
+        return [distance - data["origin"] - (1 - u) * handles[2] - u * handles[3]], [distance]
+
+    handles = [Handle("position", item=0), Handle("position", item=1)]
+    handles += [Handle("parameter", item=2 + k) for k in range(2 + 6 * moved)]
+    name = "body-moved" if moved else "body"
+    data = ("along", "origin", *(f"at_{a}" for a in AXES), *pose_names())
+    return Residual(name, tuple(handles), data, ("d",), "m", derive, _sources())
+
+
+def pose_names() -> tuple[str, ...]:
+    """Names of a camera's pose in a residual's data."""
+    from acino_fte.terms import POSE_NAMES
+
+    return POSE_NAMES
+
+
+def _sources() -> tuple[Path, ...]:
+    from acino_fte import terms
+
+    return (*_HERE, Path(terms.__file__))
