@@ -1,0 +1,228 @@
+"""Robust least squares of camera and lidar from pairs, by Levenberg and Marquardt, from one start.
+
+P pairs, D parameters. The noise of the picks is known in its proportions, not in its size: its scale is found
+from the pairs themselves, by the median first and from all that are no outliers at the end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from acino_fte.cameras import Camera
+from acino_fte.data_tools.lidar_solve_model import (
+    PickNoise,
+    Priors,
+    moved,
+    pick_covariance,
+    projection,
+    whitening,
+)
+
+CAUCHY = 2.4
+"""Where Cauchy's weight is a half, in units of the noise: 95 % efficient for Gaussian errors."""
+OUTLIER = 13.82
+"""Squared distance beyond which a pair is an outlier, in units of the noise: χ² of 2, 0.1 %."""
+_MEDIAN = 1.386  # of χ² with 2 degrees of freedom
+_LEAST = 0.03  # of the scale: nobody picks better than so many of the assumed standard deviations
+_PRIOR_PAIRS = 2.0  # how many pairs the assumed size of the noise counts for
+_FAR = 1e6  # squared distance of a pair that the camera cannot see
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The least squares at one camera.
+
+    Attributes
+    ----------
+    camera : Camera
+    names : tuple of str
+        Of the parameters.
+    residual : (P, 2)
+        Projection minus pick, px; NaN where the camera cannot see the point.
+    slope : (P, 2, D)
+        Derivative of the residual, px.
+    whiten : (P, 2, 2)
+        To units of the assumed noise.
+    priors : Priors
+    weight : (P,)
+        0 for pairs that are not used or are outliers.
+    scale : float
+        Size of the noise, compared to what was assumed.
+    converged : bool
+    """
+
+    camera: Camera
+    names: tuple[str, ...]
+    residual: np.ndarray
+    slope: np.ndarray
+    whiten: np.ndarray
+    priors: Priors
+    weight: np.ndarray
+    scale: float = 1.0
+    converged: bool = True
+
+    @property
+    def squared(self) -> np.ndarray:
+        """Squared distances (P,) in units of the assumed noise."""
+        white = np.einsum("pij,pj->pi", self.whiten, np.nan_to_num(self.residual))
+        return np.where(np.isfinite(self.residual).all(axis=1), (white**2).sum(axis=1), _FAR)
+
+    @property
+    def information(self) -> np.ndarray:
+        """Normal matrix (D, D): pairs by weight and scale, and what was known before."""
+        white = self.whiten @ np.nan_to_num(self.slope)
+        weight = self.priors.terms(self.camera, self.names)[1]
+        by_pair = (self.weight / self.scale**2)[:, None, None]
+        return np.einsum("pij,pik->jk", by_pair * white, white) + np.diag(weight**2)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance (D, D) of the parameters."""
+        return inverse(self.information)
+
+
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """Inverse of a symmetric positive matrix whose rows have units of very different size."""
+    size = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    return np.linalg.pinv(matrix * np.outer(size, size), rcond=1e-14, hermitian=True) * np.outer(size, size)
+
+
+def at(
+    camera: Camera,
+    names: tuple[str, ...],
+    pixel: np.ndarray,
+    xyz: np.ndarray,
+    noise: PickNoise,
+    priors: Priors,
+) -> Fit:
+    """The least squares at a camera, all pairs with weight 1."""
+    found, slope, for_point = projection(camera, xyz, names)
+    whiten = whitening(pick_covariance(for_point, xyz, noise))
+    return Fit(camera, names, found - pixel, slope, whiten, priors, np.ones(len(pixel)))
+
+
+def robust_fit(
+    camera: Camera,
+    names: tuple[str, ...],
+    pixel: np.ndarray,
+    xyz: np.ndarray,
+    noise: PickNoise,
+    priors: Priors,
+    *,
+    polish: bool = True,
+) -> Fit:
+    """The robust least squares from a start.
+
+    Cauchy's loss with the scale of the median finds the pairs that belong together. Then the others are left
+    out, and the rest is plain least squares (`polish`), until no pair changes sides.
+    """
+    problem = (names, pixel, xyz, noise, priors)
+    fit = at(camera, *problem)
+    scale = median_scale(fit.squared, len(names))
+    for _ in range(12):
+        fit = _descend(fit, problem, lambda d2, s=scale: 1.0 / (1.0 + d2 / (CAUCHY * s) ** 2), scale)
+        last, scale = scale, median_scale(fit.squared, len(names))
+        if abs(scale - last) < 0.02 * last:
+            break
+    fit = _replace(fit, weight=1.0 / (1.0 + fit.squared / (CAUCHY * scale) ** 2), scale=scale)
+    return _polished(fit, problem, scale) if polish else fit
+
+
+def _polished(fit: Fit, problem: tuple, scale: float) -> Fit:
+    """Plain least squares of the pairs that are no outliers."""
+    kept = fit.squared < OUTLIER * scale**2
+    seen = set()
+    for _ in range(15):
+        kept = _enough(kept, fit.squared, len(fit.names))
+        seen.add(kept.tobytes())
+        fit = _descend(fit, problem, lambda _, w=kept.astype(float): w, scale)
+        scale = final_scale(fit.squared, kept, len(fit.names))
+        least = max(scale, 0.5 * median_scale(fit.squared, len(fit.names)))
+        now = fit.squared < OUTLIER * least**2
+        if now.tobytes() in seen:
+            break
+        kept = now
+    return _replace(fit, weight=kept.astype(float), scale=scale)
+
+
+def _enough(kept: np.ndarray, squared: np.ndarray, n_parameters: int) -> np.ndarray:
+    """Never fewer pairs than half of them, nor than there are unknowns."""
+    least = min(len(kept), max((len(kept) + 1) // 2, (n_parameters + 1) // 2 + 1))
+    if kept.sum() >= least:
+        return kept
+    out = np.zeros_like(kept)
+    out[np.argsort(squared)[:least]] = True
+    return out
+
+
+def median_scale(squared: np.ndarray, n_parameters: int) -> float:
+    """Size of the noise from the median of the squared distances (P,)."""
+    n = len(squared)
+    lost = n / max(n - 0.5 * n_parameters, 0.25 * n)
+    return float(max(np.sqrt(np.median(squared) / _MEDIAN * lost), _LEAST))
+
+
+def final_scale(squared: np.ndarray, kept: np.ndarray, n_parameters: int) -> float:
+    """Size of the noise from the pairs that are kept (P,); what was assumed counts for two pairs."""
+    free = max(2.0 * kept.sum() - n_parameters, 0.0)
+    total = squared[kept].sum() + 2.0 * _PRIOR_PAIRS
+    return float(max(np.sqrt(total / (free + 2.0 * _PRIOR_PAIRS)), _LEAST))
+
+
+def _descend(fit: Fit, problem: tuple, weigh, scale: float, n_steps: int = 60) -> Fit:
+    """Levenberg and Marquardt with weights from the squared distances; the noise's shape follows the camera."""
+    damping, converged = 1e-4, False
+    for _ in range(n_steps):
+        fit = _replace(fit, weight=weigh(fit.squared), scale=scale)
+        off, prior = fit.priors.terms(fit.camera, fit.names)
+        white = fit.whiten @ np.nan_to_num(fit.slope)
+        error = np.einsum("pij,pj->pi", fit.whiten, np.nan_to_num(fit.residual))
+        by_pair = fit.weight / scale**2
+        gradient = np.einsum("p,pij,pi->j", by_pair, white, error) + prior * off
+        matrix = fit.information
+        cost = by_pair @ fit.squared + off @ off
+        fit_new, step_size, gain = None, np.inf, 0.0
+        while damping < 1e12:
+            step = -_solve(matrix + damping * np.diag(np.diag(matrix) + 1e-12), gradient)
+            trial = _trial(fit, problem, step)
+            if trial is not None:
+                ahead = trial.priors.terms(trial.camera, trial.names)[0]
+                white_now = np.einsum("pij,pj->pi", fit.whiten, np.nan_to_num(trial.residual))
+                seen = np.isfinite(trial.residual).all(axis=1)
+                squared = np.where(seen, (white_now**2).sum(axis=1), _FAR)
+                gain = cost - by_pair @ squared - ahead @ ahead
+                if gain >= -1e-12 * cost:
+                    fit_new, step_size = trial, float(np.sqrt(np.abs(step @ matrix @ step)))
+                    break
+            damping *= 10.0
+        if fit_new is None:
+            break
+        fit, damping = fit_new, max(damping * 0.1, 1e-12)
+        if step_size < 1e-6:
+            converged = True
+            break
+    return _replace(fit, weight=weigh(fit.squared), scale=scale, converged=converged)
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solution of a symmetric system whose rows have units of very different size."""
+    size = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    return size * np.linalg.lstsq(matrix * np.outer(size, size), size * right, rcond=1e-15)[0]
+
+
+def _trial(fit: Fit, problem: tuple, step: np.ndarray) -> Fit | None:
+    """The least squares after a step; None where that is no camera."""
+    if not np.isfinite(step).all() or np.abs(step[:3]).max() > 1.0:
+        return None
+    for name, change in zip(fit.names, step, strict=True):
+        if name.startswith("log_") and abs(change) > 1.0:
+            return None
+    return at(moved(fit.camera, fit.names, step), *problem)
+
+
+def _replace(fit: Fit, **changes) -> Fit:
+    from dataclasses import replace
+
+    return replace(fit, **changes)

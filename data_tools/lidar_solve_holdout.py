@@ -1,0 +1,56 @@
+"""Pairs left out: how well the others foresee them, and whether the lens needs more parameters for it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from acino_fte.data_tools.lidar_solve_fit import OUTLIER, Fit, robust_fit
+from acino_fte.data_tools.lidar_solve_model import PickNoise
+
+LENSES = (("log_aspect",), ("k1",), ("k1", "k2"), ("log_aspect", "k1"), ("log_aspect", "k1", "k2"))
+"""What may be added to focal length and principal point, the simplest first."""
+_SURE = 2.0  # standard errors by which the pairs that were left out must be foreseen better
+
+
+def left_out(fit: Fit) -> np.ndarray:
+    """Residual (P, 2) of each pair under the fit to all others, px, to first order.
+
+    The deleted residual of least squares, (1 − H_ii)⁻¹ r_i, with H the hat matrix (Cook and Weisberg 1982,
+    section 2.2.1); of a pair without weight the residual itself.
+    """
+    white = fit.whiten @ np.nan_to_num(fit.slope)
+    weight = (fit.weight / fit.scale**2)[:, None, None]
+    hat = weight * (white @ fit.covariance @ white.transpose(0, 2, 1))
+    error = np.einsum("pij,pj->pi", fit.whiten, np.nan_to_num(fit.residual))
+    deleted = np.linalg.solve(np.eye(2) * (1.0 + 1e-9) - hat, error[..., None])
+    known = np.isfinite(fit.residual).all(axis=1) & (np.abs(fit.whiten).sum(axis=(1, 2)) > 0)
+    out = fit.residual.copy()
+    out[known] = np.linalg.solve(fit.whiten[known], deleted[known])[..., 0]
+    return out
+
+
+def left_out_squared(fit: Fit) -> np.ndarray:
+    """Squared distances (P,) of the pairs that were left out, in units of the assumed noise."""
+    white = np.einsum("pij,pj->pi", fit.whiten, np.nan_to_num(left_out(fit)))
+    return (white**2).sum(axis=1)
+
+
+def choose_lens(fit: Fit, pixel: np.ndarray, xyz: np.ndarray, noise: PickNoise) -> Fit:
+    """The fit with the parameters of the lens that pairs left out support; the given one, if none.
+
+    A lens with more parameters is taken where it foresees left-out pairs better by two standard errors, and
+    by more than a simpler one does.
+    """
+    best, gain = fit, 0.0
+    for more in LENSES:
+        names = fit.names + more
+        if len(names) > len(pixel):  # fewer than two numbers a parameter
+            continue
+        trial = robust_fit(fit.camera, names, pixel, xyz, noise, fit.priors)
+        limit = OUTLIER * fit.scale**2
+        better = np.minimum(left_out_squared(fit), limit) - np.minimum(left_out_squared(trial), limit)
+        better /= fit.scale**2
+        sure = better.sum() - _SURE * np.sqrt(len(better)) * better.std(ddof=1)
+        if sure > 0 and better.sum() > gain + 2.0 * (len(names) - len(best.names)):
+            best, gain = trial, better.sum()
+    return best
