@@ -200,6 +200,8 @@ def read_lidar_camera(
     *,
     camera: Camera | Path | str | None = None,
     points: np.ndarray | None = None,
+    resolution: tuple[int, int] | None = None,
+    view: str = "P2",
 ) -> LidarCamera:
     """Read a calibration of a camera to a lidar: the project's JSON, or what other programs write.
 
@@ -215,6 +217,10 @@ def read_lidar_camera(
     points : (K, 3), optional
         Points of the cloud, m: where the direction is not known, the message tells for each of the two how
         many of them it would bring into the image.
+    resolution : (width, height), optional
+        px; KITTI's file does not have it.
+    view : str
+        Which of KITTI's cameras, ``P0`` to ``P3``; ``P2`` is the left one in colour.
 
     Raises
     ------
@@ -224,4 +230,4 @@ def read_lidar_camera(
     """
     from acino_fte.data_tools.lidar_camera_formats import read_any
 
-    return read_any(Path(path), direction, camera, points)
+    return read_any(Path(path), direction, camera, points, resolution, view)

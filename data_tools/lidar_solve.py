@@ -212,16 +212,19 @@ def _free(
         )
     if focal is not None and not isinstance(focal, tuple):
         fit = tuple(key for key in fit if key != "f")
-    if "distortion" in fit and camera is not None:
-        if camera.model != "pinhole" or len(camera.distortion) > 5:
-            raise InputError(
-                "The distortion of this lens cannot be fitted.",
-                key="fit",
-                expected="a pinhole lens with at most 5 coefficients",
-                found=f"'{camera.model}' with {len(camera.distortion)}",
-                remedy="hold the distortion as it was calibrated",
-            )
+    if "distortion" in fit and camera is not None and not _plain(camera):
+        raise InputError(
+            "The distortion of this lens cannot be fitted.",
+            key="fit",
+            expected="a pinhole lens with at most 5 coefficients",
+            found=f"'{camera.model}' with {len(camera.distortion)}",
+            remedy="hold the distortion as it was calibrated",
+        )
     return tuple(fit)
+
+
+def _plain(camera: Camera) -> bool:
+    return camera.model == "pinhole" and len(camera.distortion) <= 5
 
 
 def _check_enough(pixel: np.ndarray, xyz: np.ndarray, n_parameters: int, camera: Camera) -> None:

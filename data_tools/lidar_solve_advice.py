@@ -67,9 +67,9 @@ def advice(fit: Fit, ambiguity: FocalDepth, xyz: np.ndarray, noise: PickNoise) -
             f"These pairs cannot fix focal length and depth apart: the focal length is known to "
             f"{_percent(ambiguity.alone)} from them, and would be to {_percent(ambiguity.with_depth)} if the "
             f"depth were known ({ambiguity.ratio:.0f} times surer). All of them are {distance.min():.1f} to "
-            f"{distance.max():.1f} m away and nearly face the camera. At these distances the calibration holds; "
-            f"at others it may not. Tilt the board by 30° and more, add a second distance at the same zoom, or "
-            f"give the focal length of the lens."
+            f"{distance.max():.1f} m away and nearly face the camera. The calibration holds at "
+            f"these distances; at others it may not. Tilt the board by 30° and more, add a second distance "
+            f"at the same zoom, or give the focal length of the lens."
         )
     return tuple(out)
 

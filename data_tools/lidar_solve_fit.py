@@ -137,7 +137,8 @@ def _polished(fit: Fit, problem: tuple, scale: float) -> Fit:
     for _ in range(15):
         kept = _enough(kept, fit.squared, len(fit.names))
         seen.add(kept.tobytes())
-        fit = _descend(fit, problem, lambda _, w=kept.astype(float): w, scale)
+        fixed = kept.astype(float)
+        fit = _descend(fit, problem, lambda _, w=fixed: w, scale)
         scale = final_scale(fit.squared, kept, len(fit.names))
         least = max(scale, 0.5 * median_scale(fit.squared, len(fit.names)))
         now = fit.squared < OUTLIER * least**2
@@ -172,7 +173,7 @@ def final_scale(squared: np.ndarray, kept: np.ndarray, n_parameters: int) -> flo
 
 
 def _descend(fit: Fit, problem: tuple, weigh, scale: float, n_steps: int = 60) -> Fit:
-    """Levenberg and Marquardt with weights from the squared distances; the noise's shape follows the camera."""
+    """Levenberg and Marquardt with weights from squared distances; the noise's shape follows the camera."""
     damping, converged = 1e-4, False
     for _ in range(n_steps):
         fit = _replace(fit, weight=weigh(fit.squared), scale=scale)

@@ -99,7 +99,7 @@ def moved(camera: Camera, names: tuple[str, ...], step: np.ndarray) -> Camera:
 def projection(
     camera: Camera, xyz: np.ndarray, names: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels (P, 2) of points (P, 3), and their derivatives for the parameters (P, 2, D) and points (P, 2, 3).
+    """Pixels (P, 2) of points (P, 3), with derivatives for parameters (P, 2, D) and points (P, 2, 3).
 
     The derivative for the point in the camera's frame is the generated one of :mod:`acino_fte.projection`;
     the rest is the chain rule. NaN behind the camera.

@@ -27,6 +27,7 @@ def starts(camera: Camera, free_focal: bool, pixel: np.ndarray, xyz: np.ndarray)
     camera : Camera
         Its lens is used as it is, but for the focal length where that is free.
     free_focal : bool
+        Whether it is.
     pixel, xyz : (P, 2), (P, 3)
         The pairs.
     """
