@@ -2,7 +2,7 @@
 
 The sensor is like a Livox Tele-15: 240 000 points a second in a field of 14.5° by 16.2°. Its pattern here
 is a model, not Livox's own: six beams draw a rosette whose two turns are in no whole ratio, and whose radius
-is such that the density is the same all over the ellipse. A point comes 4.17 µs after the one before. Beams
+is such that the density is the same all over the ellipse. A point comes 4167 ns after the one before. Beams
 are lines without width.
 
 Frame of the lidar, as Livox has it: x forward, y left, z up.
@@ -110,6 +110,11 @@ def scan_directions(time: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], axis=1)
 
 
+def firing_period(options: RigOptions) -> float:
+    """True time between two points, s: whole nanoseconds of the lidar's own clock."""
+    return 1e-9 * round(1e9 / options.points_per_second) / (1.0 + 1e-6 * options.lidar_drift_ppm)
+
+
 def mean_density(distance: float, points_per_second: float = 240_000.0) -> float:
     """Returns per second and square metre of a surface that faces the lidar at a distance (m)."""
     return points_per_second / (math.pi / 4 * FIELD[0] * FIELD[1] * distance**2)
@@ -139,13 +144,14 @@ def scan(
 ) -> Returns:
     """All returns from half a frame before the first frame to half a frame after the last."""
     start, stop = -0.5 / options.fps, (options.n_frames - 0.5) / options.fps
-    first, last = math.ceil(start * options.points_per_second), math.ceil(stop * options.points_per_second)
+    period = firing_period(options)
+    first, last = math.ceil(start / period), math.ceil(stop / period)
     first -= first % BEAMS
     rng = {name: options.stream(name) for name in ("grass", "range", "direction", "background", "intensity")}
     body = Body.of(options, motion)
     parts = []
     for index in range(first, last, _CHUNK):
-        time = np.arange(index, min(index + _CHUNK, last)) / options.points_per_second
+        time = np.arange(index, min(index + _CHUNK, last)) * period
         parts.append(_scan_part(options, motion, path, lidar_to_camera, scenery, body, time, rng))
     return Returns(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
