@@ -7,9 +7,10 @@ animal. On the link from a to b, the point that is nearest in the image to the r
     u = clip( (x̃/z̃ − a/z_a)·(b/z_b − a/z_a) / |b/z_b − a/z_a|², 0, 1 ),
 
 at a lateral distance g (m, at the depth of the return), and the return lies f = z(u) − z̃ before it. A return
-is attached to the link with the least (g/σ_g)² + ((f − s)/σ_f)², where s is the surface of that link, and to
-none when that is large: grass, bushes and a neighbour fail along the ray although they are near in the image.
-What is attached is moved to the time of its frame with the link.
+is attached to the link with the least (g/σ_g)² + ((f − c s)/σ_f)², where s is the surface of that link and
+c = √(1 − (g/s)²) how much of it a round body has there, and to none when that is large: grass, bushes and a
+neighbour fail along the ray although they are near in the image. What is attached is moved to the time of its
+frame with the link.
 
 The thesis's way stays for comparison: the nearest return in the image of a whole scan, whatever its depth.
 Shapes: K returns, N frames, M markers, E links to draw.
@@ -25,7 +26,6 @@ from acino_fte.cameras import Camera
 from acino_fte.depth import BodyReturns, DepthData, MarkerDepths
 from acino_fte.errors import InputError
 from acino_fte.lidar import Lidar
-from acino_fte.losses import Loss
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton
 
@@ -33,7 +33,9 @@ ASSOCIATIONS = ("marker", "body", "nearest", "none")
 _REACH = 0.25  # m: returns farther to the side of every link are not looked at
 _SIDE = 0.05  # m, σ_g: how far to the side of a link its surface reaches
 _GATE = 9.0  # of the squared distance above: three standard deviations
+_SIDE_SD = 0.01  # m: how well the side is known at which a ray passes a link
 _SHAPE = 0.015  # m, standard deviation of the surface about a capsule
+_LEAST_BULGE = 0.3
 _SLOPE = 0.15  # of the way from a return to its marker along the link, as depth that the pose may be wrong by
 _SCAN = 0.1  # s: what the thesis takes for one frame of the lidar
 _NEAREST_SD = 0.05  # m, of the thesis's way
@@ -46,7 +48,7 @@ class Attached:
 
     ``row`` (K,) is the return's place in the lidar's arrays, ``frame`` (K,) the nearest frame's index,
     ``start``, ``end`` (K,) the markers of its link, ``along`` (K,) is u, ``side`` and ``front`` (K,) are g
-    and f, m; ``xyz`` (K, 3) is the return in the camera's frame at the time of the frame, m.
+    and f, m; ``bulge`` (K,) is c; ``depth`` (K,) is z in the camera's frame at the time of the frame, m.
     """
 
     row: np.ndarray
@@ -56,7 +58,8 @@ class Attached:
     along: np.ndarray
     side: np.ndarray
     front: np.ndarray
-    xyz: np.ndarray
+    bulge: np.ndarray
+    depth: np.ndarray
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -78,6 +81,7 @@ def associate(
     ----------
     sequence : Sequence
         With a lidar.
+    skeleton : Skeleton
     positions : (N, M, 3)
         Where the markers are, as far as is known, m.
     surface : (M,)
@@ -112,8 +116,8 @@ def associate(
     rate = _depth_rate(local, sequence.fps)
     if how == "body":
         sd = np.sqrt(_own_variance(lidar, found, rate))
-        measured = BodyReturns(found.frame, found.start, found.end, found.along, found.xyz, sd)
-        return DepthData(camera.name, measured, loss=Loss("geman_mcclure"))
+        places = (found.frame, found.start, found.end, found.along, found.bulge)
+        return DepthData(camera.name, BodyReturns(*places, found.depth, sd))
     return DepthData(camera.name, marker_depths(lidar, found, local, surface, rate))
 
 
@@ -129,16 +133,18 @@ def attach(
     """Attach returns to links; `local` (N, M, 3) are markers in the camera's frame, m."""
     row, frame, before, share = _in_time(lidar, frames, fps)
     xyz = lidar.to_camera()[row]
-    near = _near_body(xyz, local, frame, front_sd)
+    near = _near_body(xyz, local, before, front_sd)
     row, frame, before, share, xyz = (v[near] for v in (row, frame, before, share, xyz))
     links = _links(skeleton)
     then = local[before] + share[:, None, None] * (
         local[np.minimum(before + 1, len(local) - 1)] - local[before]
     )
     along, side, front = _against_links(xyz, then, links)
-    expected = (1 - along) * surface[links[:, 0]] + along * surface[links[:, 1]]  # (K, E)
+    radius = (1 - along) * surface[links[:, 0]] + along * surface[links[:, 1]]  # (K, E)
+    bulge = _bulge(side, radius)
     width = min(front_sd, _WIDEST)
-    cost = (side / _SIDE) ** 2 + ((front - expected) / width) ** 2
+    reach = np.maximum(_SIDE, radius)
+    cost = (side / reach) ** 2 + ((front - bulge * radius) / width) ** 2
     best = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=1) if len(xyz) else np.zeros(0, int)
     every = np.arange(len(xyz))
     good = cost[every, best] < _GATE
@@ -153,8 +159,14 @@ def attach(
         u,
         side[every, best],
         front[every, best],
-        xyz[every] + moved,
+        bulge[every, best],
+        (xyz[every] + moved)[:, 2],
     )
+
+
+def _bulge(side: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """c = √(1 − (g/r)²), not less than :data:`_LEAST_BULGE`: shapes are not that round."""
+    return np.sqrt(np.maximum(1.0 - (side / np.maximum(radius, 1e-9)) ** 2, _LEAST_BULGE**2))
 
 
 def marker_depths(
@@ -170,8 +182,8 @@ def marker_depths(
     on_link = _on_link(local[found.frame], found.start, found.end, found.along)
     marker = local[found.frame, nearer]
     u = found.along
-    thicker = surface[nearer] - ((1 - u) * surface[found.start] + u * surface[found.end])
-    depth = found.xyz[:, 2] + marker[:, 2] - on_link[:, 2] - thicker
+    thicker = surface[nearer] - found.bulge * ((1 - u) * surface[found.start] + u * surface[found.end])
+    depth = found.depth + marker[:, 2] - on_link[:, 2] - thicker
     way = np.linalg.norm(marker - on_link, axis=1)
     own = _own_variance(lidar, found, rate)
     carried = own + (_SLOPE * way) ** 2
@@ -214,7 +226,7 @@ def nearest_depths(sequence: Sequence, camera: Camera, pixels: np.ndarray) -> Ma
 
 
 def _in_time(lidar: Lidar, frames: np.ndarray, fps: float) -> tuple[np.ndarray, ...]:
-    """Returns within the sequence: rows, nearest frame's index, the frame before, share of the way to the next."""
+    """Returns within the sequence: rows, the nearest frame, the one before, share of the way to the next."""
     place = lidar.time * fps - frames[0]
     row = np.flatnonzero((place >= -0.5) & (place < len(frames) - 0.5))
     place = place[row]
@@ -223,12 +235,12 @@ def _in_time(lidar: Lidar, frames: np.ndarray, fps: float) -> tuple[np.ndarray, 
     return row, frame, before, place - before
 
 
-def _near_body(xyz: np.ndarray, local: np.ndarray, frame: np.ndarray, front_sd: float) -> np.ndarray:
-    """Rows of returns within reach of the box about the markers of their frame."""
-    lower, upper = local.min(axis=1) - _REACH, local.max(axis=1) + _REACH
-    lower[:, 2] -= 3 * front_sd
-    upper[:, 2] += 3 * front_sd
-    return np.flatnonzero(((xyz >= lower[frame]) & (xyz <= upper[frame])).all(-1))
+def _near_body(xyz: np.ndarray, local: np.ndarray, before: np.ndarray, front_sd: float) -> np.ndarray:
+    """Rows of returns within reach of the box about the markers of the frames before and after them."""
+    reach = np.array([_REACH, _REACH, _REACH + 3 * front_sd])
+    lower, upper = local.min(axis=1) - reach, local.max(axis=1) + reach
+    lower[:-1], upper[:-1] = np.minimum(lower[:-1], lower[1:]), np.maximum(upper[:-1], upper[1:])
+    return np.flatnonzero(((xyz >= lower[before]) & (xyz <= upper[before])).all(-1))
 
 
 def _links(skeleton: Skeleton) -> np.ndarray:
@@ -269,4 +281,5 @@ def _depth_rate(local: np.ndarray, fps: float) -> np.ndarray:
 
 def _own_variance(lidar: Lidar, found: Attached, rate: np.ndarray) -> np.ndarray:
     """Variance of every return, m²: its range, the body's shape, and the synchronisation."""
-    return lidar.range_sd**2 + _SHAPE**2 + (lidar.time_sd * rate[found.frame]) ** 2
+    steep = _SIDE_SD * np.sqrt(1.0 - found.bulge**2) / found.bulge  # of a round body, where the ray passes
+    return lidar.range_sd**2 + _SHAPE**2 + steep**2 + (lidar.time_sd * rate[found.frame]) ** 2

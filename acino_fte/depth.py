@@ -6,14 +6,16 @@ marker, the depth residual is (the thesis's e_depth, whose surface is the joint:
 
     d = z(p_m) − s_m − z̃.
 
-When the whole body is asked for, every return x̃ on it counts as a distance to a capsule around the link
-between two markers a, b,
+When the whole body is asked for, every return on it counts as a distance, along its ray, to a capsule around
+the link between two markers a, b. A ray that passes the link's axis at the side g meets a capsule of radius r
+at √(r² − g²) = c r before the axis, so
 
-    d = |R ((1 − u) p_a + u p_b) + t − x̃| − ((1 − u) s_a + u s_b),
+    d = z((1 − u) p_a + u p_b) − c ((1 − u) s_a + u s_b) − z̃,
 
-with 0 ≤ u ≤ 1 held where the return was attached. The surface s has a Gaussian prior about what the body's
-capsules, or a limb's usual thickness, let expect. Which return belongs to what is decided by
-:mod:`acino_fte.association`.
+with 0 ≤ u ≤ 1 and c held as they were when the return was attached. (The distance from the axis less r is no
+substitute: with a range noise of the size of r it has no sign, and draws the animal onto its own skin.) The
+surface s has a Gaussian prior about what the body's capsules, or a limb's usual thickness, let expect. Which
+return belongs to what is decided by :mod:`acino_fte.association`.
 """
 
 from __future__ import annotations
@@ -25,11 +27,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acino_fte import terms
 from acino_fte.cameras import Camera
 from acino_fte.losses import Loss
 from acino_fte.parameters import POSE, Parameters
 from acino_fte.residuals import AXES, Derived, Handle, Let, Residual
-from acino_fte.terms import Term, in_camera, moved_in_camera, pose_data
+from acino_fte.terms import POSE_NAMES, Term, in_camera, moved_in_camera, pose_data
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -39,7 +42,7 @@ if TYPE_CHECKING:
 LIMB = 0.03
 """How far the surface lies before a joint of a limb, m, and the standard deviation of that."""
 _SHARE = 0.5  # standard deviation of a surface that the species' capsules tell, as a share of their radius
-_HERE = (Path(__file__),)
+_SOURCES = (Path(__file__), Path(terms.__file__))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +83,10 @@ class BodyReturns:
         Markers at the ends of the link.
     along : (K,)
         u: where on the link, 0 at `start` to 1 at `end`.
-    xyz : (K, 3)
-        m, the camera's frame, moved to the time of the frame.
+    bulge : (K,)
+        c: how much of the surface's distance lies before the link where the ray passes.
+    depth : (K,)
+        z of the return in the camera's frame, moved to the time of the frame, m.
     sd : (K,)
         m.
     """
@@ -90,7 +95,8 @@ class BodyReturns:
     start: np.ndarray
     end: np.ndarray
     along: np.ndarray
-    xyz: np.ndarray
+    bulge: np.ndarray
+    depth: np.ndarray
     sd: np.ndarray
 
     def __len__(self) -> int:
@@ -171,15 +177,14 @@ def _body_term(
     origins, u = _origins(parameters), found.along
     values = {
         "along": u,
+        "bulge": found.bulge,
         "origin": (1 - u) * origins[items[:, 2]] + u * origins[items[:, 3]],
-        **{f"at_{a}": found.xyz[:, i] for i, a in enumerate(AXES)},
+        "depth": found.depth,
         **pose_data(camera, found.frame, n_frames),
     }
     numbers = np.arange(len(found))
-    return Term(
-        "depth", body_residual(moved=bool(pose)), found.frame, items, values, found.sd, data.loss,
-        camera.name, numbers,
-    )  # fmt: skip
+    residual = body_residual(moved=bool(pose))
+    return Term("depth", residual, found.frame, items, values, found.sd, data.loss, camera.name, numbers)
 
 
 def _camera_places(camera: Camera, parameters: Parameters) -> tuple[list[int], int | None]:
@@ -210,20 +215,18 @@ def depth_residual(*, moved: bool = False, delayed: bool = False, surface: bool 
     handles = [Handle("position", delay=1 if delayed else None)]
     handles += [Handle("parameter", item=count + k) for k in range(6 * moved + surface)]
     name = "-".join(["depth"] + ["moved"] * moved + ["delayed"] * delayed + ["surface"] * surface)
-    data = ("depth", "origin", *pose_names())
-    return Residual(name, tuple(handles), data, ("d",), "m", derive, _sources())
+    data = ("depth", "origin", *POSE_NAMES)
+    return Residual(name, tuple(handles), data, ("d",), "m", derive, _SOURCES)
 
 
 @cache
 def body_residual(*, moved: bool = False) -> Residual:
-    """Distance of a return to the capsule around a link, m: |x_link(u) − x̃| − (origin + (1 − u) s_a + u s_b).
+    """Distance of a return to the capsule around a link, m: z(u) − c (origin + (1 − u) s_a + u s_b) − depth.
 
     Items: the two markers, their two surfaces, then the camera's correction, when ``moved``.
     """
 
     def derive(handles: list[Any], data: dict[str, sp.Symbol], let: Let) -> Derived:
-        import sympy as sp
-
         u = data["along"]
         on_link = tuple(
             let(f"link_{a}", (1 - u) * p + u * q)
@@ -232,25 +235,11 @@ def body_residual(*, moved: bool = False) -> Residual:
         local = in_camera(on_link, data, let)
         if moved:
             local = moved_in_camera(local, handles[4:7], handles[7:10], let)
-        gap = [let(f"gap_{a}", x - data[f"at_{a}"]) for a, x in zip(AXES, local, strict=True)]
-        distance = let("distance", sp.sqrt(sum(g * g for g in gap)))
-        return [distance - data["origin"] - (1 - u) * handles[2] - u * handles[3]], [distance]
+        surface = data["origin"] + (1 - u) * handles[2] + u * handles[3]
+        return [local[2] - data["bulge"] * surface - data["depth"]], []
 
     handles = [Handle("position", item=0), Handle("position", item=1)]
     handles += [Handle("parameter", item=2 + k) for k in range(2 + 6 * moved)]
     name = "body-moved" if moved else "body"
-    data = ("along", "origin", *(f"at_{a}" for a in AXES), *pose_names())
-    return Residual(name, tuple(handles), data, ("d",), "m", derive, _sources())
-
-
-def pose_names() -> tuple[str, ...]:
-    """Names of a camera's pose in a residual's data."""
-    from acino_fte.terms import POSE_NAMES
-
-    return POSE_NAMES
-
-
-def _sources() -> tuple[Path, ...]:
-    from acino_fte import terms
-
-    return (*_HERE, Path(terms.__file__))
+    data = ("along", "bulge", "origin", "depth", *POSE_NAMES)
+    return Residual(name, tuple(handles), data, ("d",), "m", derive, _SOURCES)

@@ -3,8 +3,8 @@
 1. start: triangulation and inverse kinematics (:mod:`acino_fte.initialise`), and a rough fit with the
    species' proportions and table of noise and the given calibration;
 2. measurement noise from the residuals (:mod:`acino_fte.noise`), exchanged sides and better candidates
-   (:mod:`acino_fte.assignments`; the rough fit is repeated while these change), and which parameters the data
-   can tell (:mod:`acino_fte.observable`);
+   (:mod:`acino_fte.assignments`; the rough fit is repeated while these change), returns of a lidar
+   (:mod:`acino_fte.fusion`), and which parameters the data can tell (:mod:`acino_fte.observable`);
 3. a fit with the parameters, then noise and assignments once more;
 4. the final fit, to the solver's tolerance, and its covariance (:mod:`acino_fte.posterior`).
 
@@ -23,9 +23,11 @@ import numpy as np
 
 from acino_fte.arrow import NotPositiveDefinite
 from acino_fte.assignments import Assignment, resolve
+from acino_fte.association import ASSOCIATIONS
 from acino_fte.contact import contact_terms
 from acino_fte.diagnosis import diagnose
 from acino_fte.errors import InputError
+from acino_fte.fusion import Fusion
 from acino_fte.initialise import initial_trajectory
 from acino_fte.kinematics import Kinematics
 from acino_fte.noise import estimate_noise
@@ -68,6 +70,8 @@ class EstimateOptions:
         Work out the posterior covariance.
     lowering : str
         ``"condensed"``, or ``"explicit"`` for the final fit.
+    association : str
+        How returns of a lidar are associated (:data:`acino_fte.association.ASSOCIATIONS`).
     """
 
     problem: FTEOptions = field(default_factory=FTEOptions)
@@ -79,6 +83,7 @@ class EstimateOptions:
     tune_noise: bool = False
     covariance: bool = True
     lowering: str = "condensed"
+    association: str = "marker"
 
     def __post_init__(self) -> None:
         if self.fit is not None:
@@ -86,6 +91,7 @@ class EstimateOptions:
         for key, value, known in (
             ("noise", self.noise, NOISES),
             ("lowering", self.lowering, ("condensed", "explicit")),
+            ("association", self.association, ASSOCIATIONS),
         ):
             if value not in known:
                 raise InputError(
@@ -95,7 +101,7 @@ class EstimateOptions:
     def summary(self) -> dict[str, Any]:
         """The options as plain values for the record."""
         chosen = "observable" if self.fit is None else list(self.fit)
-        names = ("noise", "swaps", "contact", "tune_noise", "covariance", "lowering")
+        names = ("noise", "swaps", "contact", "tune_noise", "covariance", "lowering", "association")
         return {"fit": chosen, **{name: getattr(self, name) for name in names}}
 
 
@@ -159,6 +165,7 @@ class _Estimate:
         self.fit: tuple[str, ...] = ()
         self.assignment: Assignment | None = None
         self.extra: tuple[Term, ...] = ()
+        self.fuse = Fusion(sequence, self.skeleton, self.options.association, self.detected)
         self.findings: list[str] = []
         self.contacts: list[str] = []
         self.iterations = 0
@@ -175,6 +182,8 @@ class _Estimate:
         """Run all stages."""
         with self._timed("initialise"):
             self.q = initial_trajectory(self.sequence, self.kinematics, self.options.problem)
+            self.fuse.look(self.kinematics.positions(self.q), None)
+            self.assumed = replace(self.assumed, depth=self.fuse.data)
         with self._timed("solve"):
             spread = None
             try:
@@ -191,7 +200,7 @@ class _Estimate:
 
     def _fits(self) -> tuple[FTEProblem, Minimum]:
         options = self.options
-        adaptive = options.noise == "estimated" or options.swaps or options.contact
+        adaptive = options.noise == "estimated" or options.swaps or options.contact or self.fuse.used
         if adaptive or options.fit is None:
             for _ in range(_LOOKS):
                 if not self._look(*self._fit(_ROUGH), None):
@@ -232,6 +241,8 @@ class _Estimate:
         The noise comes first: sides are judged by it, and a table that is too small exaggerates the evidence.
         """
         self._measure(problem, minimum, spread)
+        self.fuse.look(problem.positions(minimum.q, minimum.theta), (problem.parameters, minimum.theta))
+        self.assumed = replace(self.assumed, depth=self.fuse.data)
         changed = self.options.swaps and self._assign(problem, minimum)
         if changed:
             with self._timed("build"):
@@ -339,6 +350,9 @@ class _Estimate:
             parameters=self._parameters(problem, minimum, spread),
             q_sd=None if spread is None else spread.q_sd,
             position_covariance=None if spread is None else spread.positions,
+            depth=self.fuse.residuals(
+                problem.positions(minimum.q, minimum.theta), (problem.parameters, minimum.theta)
+            ),
             findings=(*self._at_bounds(problem), *self._findings(observed, predicted, sd)),
         )
 
@@ -371,4 +385,9 @@ class _Estimate:
         found = list(self.findings)
         if self.assignment is not None:
             found += self.assignment.findings(cameras, frames, self.skeleton)
-        return found + self.contacts + diagnose(observed, predicted, self.sequence.fps, cameras, frames, sd)
+        return (
+            found
+            + self.fuse.findings()
+            + self.contacts
+            + diagnose(observed, predicted, self.sequence.fps, cameras, frames, sd)
+        )

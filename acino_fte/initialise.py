@@ -1,6 +1,7 @@
 """A start for the solver: triangulate, find the heading, then one smooth inverse-kinematics solve.
 
-A start with all joints at zero ends in bad local minima; this one does not (see docs/theory.md).
+One view has nothing to triangulate: see :mod:`acino_fte.single_view`. A start with all joints at zero ends in
+bad local minima; this one does not (see docs/theory.md).
 """
 
 from __future__ import annotations
@@ -33,6 +34,10 @@ def initial_trajectory(
         No marker can be triangulated anywhere.
     """
     options = options or FTEOptions()
+    if len(sequence.cameras) == 1:
+        from acino_fte.single_view import single_view_trajectory
+
+        return single_view_trajectory(sequence, kinematics, options)
     pixels = sequence.pixels(kinematics.skeleton.marker_names, options.likelihood)
     for stride in (_COARSE, 1) if sequence.n_frames >= 8 * _COARSE else (1,):
         some = slice(None, None, stride)
@@ -61,8 +66,10 @@ def smooth_inverse_kinematics(
     return minimum.q
 
 
-def pose_start(kinematics: Kinematics, points: np.ndarray) -> np.ndarray:
+def pose_start(kinematics: Kinematics, points: np.ndarray, turn: float = 0.0) -> np.ndarray:
     """Mid-range joint angles; root position and heading from the data, (N, Q).
+
+    ``turn`` is added to the heading, rad; the animal stays where it is.
 
     Per frame, the markers of the mid-range pose are turned about the vertical and moved onto the
     triangulated ones: with both centred, the angle that minimises the squared distance is
@@ -89,7 +96,7 @@ def pose_start(kinematics: Kinematics, points: np.ndarray) -> np.ndarray:
         turned = _turn(body, np.nan_to_num(angle))
         distance2 = ((turned - seen) ** 2).sum(-1)
         weight = np.isfinite(points).all(-1) / (1.0 + distance2 / 0.15**2)
-    angle = _fill(np.unwrap(_fill(angle)))
+    angle = _fill(np.unwrap(_fill(angle))) + turn
     turned = _turn(np.broadcast_to(shape, points.shape), angle)
     offset = (weight[..., None] * (known - turned)).sum(1) / np.maximum(weight.sum(1), 1e-12)[:, None]
     offset = _fill(np.where(weight.sum(1)[:, None] > 1e-6, offset, np.nan))

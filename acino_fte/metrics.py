@@ -80,6 +80,7 @@ def result_metrics(result: FTEResult) -> dict[str, Any]:
         "warnings": list(sequence.warnings),
     }
     optional = {
+        "depth_m": None if result.depth is None else result.depth.metrics(),
         "truth_mm": truth_metrics(result),
         "uncertainty": uncertainty_metrics(result),
         "parameter_errors": parameter_errors(result) or None,

@@ -12,6 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     import xarray as xr
 
+    from acino_fte.fusion import DepthResiduals
     from acino_fte.sequence import Sequence
     from acino_fte.skeleton import Skeleton
 
@@ -91,6 +92,8 @@ class FTEResult:
     findings : tuple of str
         What the estimate noticed about the recording: swapped sides, cameras that moved or are out of
         step, parameters that could not be observed. One sentence each.
+    depth : DepthResiduals, optional
+        Measured and predicted depths, with a lidar.
     evaluation : dict
         Fields for ``metrics.json`` from an evaluation on cameras left out (:mod:`acino_fte.holdout`).
     """
@@ -113,6 +116,7 @@ class FTEResult:
     q_sd: np.ndarray | None = None
     position_covariance: np.ndarray | None = None
     findings: tuple[str, ...] = ()
+    depth: DepthResiduals | None = None
     evaluation: dict[str, Any] = field(default_factory=dict)
 
     @cached_property
