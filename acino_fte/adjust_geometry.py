@@ -8,7 +8,7 @@ pose (see :meth:`acino_fte.cameras.Camera.at_frames`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,7 +18,6 @@ NEAREST = 0.01
 """m: no point is brought nearer to a camera than that."""
 _STEPS = 30
 _CONVERGED = 1e-12
-_NO_SHIFT = np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +36,13 @@ class Sight:
 
     camera: Camera
     pixel: np.ndarray
-    shift: np.ndarray = _NO_SHIFT
+    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 def still(camera: Camera, frame: int) -> Camera:
     """A camera with the one pose that it has in a frame (row of its poses)."""
     if not camera.moves:
         return camera
-    from dataclasses import replace
-
     rotation, translation = camera.rotation, camera.translation
     return replace(
         camera,

@@ -316,7 +316,7 @@ def _rmse(axes: Axes, values: np.ndarray, *, signed: bool) -> None:
 def _note(axes: Axes, lines: Sequence[str]) -> None:
     axes.text(
         0.99, 0.98, "\n".join(lines), transform=axes.transAxes, ha="right", va="top", fontsize=7,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.9, "pad": 1.0},
     )  # fmt: skip
 
 
