@@ -243,6 +243,7 @@ class _Grid:
         self.clock: Clock = "unknown"
         self._kind, self._step, self._path = kind, step, path
         self._start: int | None = None
+        self._last = 0  # time of the last return
         self._first = 0  # number of the first package since the start
         self._done = 0  # packages written since the start
         self._wait: tuple[np.ndarray, ...] = ()
@@ -254,20 +255,19 @@ class _Grid:
         time = np.asarray(value.time_ns, np.int64)
         columns: tuple[np.ndarray, ...] = (time, value.xyz, value.intensity, value.tag)
         ready = []
-        last = int(self._wait[0][-1]) if self._wait else int(time[0])
-        if (self._start is not None and time[0] - last > _PAUSE_NS) or value.clock != self.clock:
+        if (self._start is not None and time[0] - self._last > _PAUSE_NS) or value.clock != self.clock:
             ready = self.flush()
             self._start, self._first, self._done = None, self._first + self._done, 0
-        self.clock = value.clock
+        self.clock, self._last = value.clock, int(time[-1])
         if self._start is None:
             self._start = int(time[0])
         if self._wait:
             columns = tuple(np.concatenate(pair) for pair in zip(self._wait, columns, strict=True))
         slots = self._slots(columns[0])
         package = slots // self._kind.samples
-        full = package < package[-1]
-        self._wait = tuple(column[~full] for column in columns)
-        stop = int(package[-1])
+        stop = (int(slots[-1]) + 1) // self._kind.samples  # a package that is full need not wait
+        full = package < stop
+        self._wait = tuple(column[~full] for column in columns) if not full.all() else ()
         if full.any():
             ready += self._packages(slots[full], tuple(column[full] for column in columns), stop)
         return ready

@@ -1,0 +1,395 @@
+"""Walk through an LVX file from package to package, and find the way again after damage.
+
+Nothing in a frame's header is needed to read its packages, and recording programs write wrong offsets
+there. So a header is only a mark between packages. Where neither a package nor a header stands, the walk
+searches the next place from where packages follow one another again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from struct import Struct
+from typing import BinaryIO
+
+import numpy as np
+
+from acino_fte.data_tools.lvx_packets import FARTHEST_M, Layout, decode_imu, decode_points, decode_stamps
+
+_BLOCK = 4 << 20
+_LOOK = 16_384  # more than three packages and three headers
+_BEHIND = 2_048  # the last package stays in reach
+_MOST = 4_096  # packages handed over at once, where no frame ends them
+_THREE = Struct("<QQQ")
+_LENGTH = Struct("<I")
+_LONGEST_FRAME = 1 << 28
+
+
+class PackageTest:
+    """Whether a package begins at a place, how long it is, and whose it is.
+
+    Parameters
+    ----------
+    layout : Layout
+    devices : mapping of int to int, optional
+        Index of the device by what packages call it; any device is taken without.
+    """
+
+    def __init__(self, layout: Layout, devices: dict[int, int] | None = None) -> None:
+        self.layout, self.devices = layout, devices
+        self.second = layout.version == "2"
+        self.header = layout.header.itemsize
+        self._sizes = {kind: layout.package(kind).itemsize for kind in layout.kinds}
+        self._steps = {kind: layout.kinds[kind].sample.itemsize for kind in layout.kinds}
+
+    def size(self, data: bytes, at: int) -> int:
+        """Bytes of the package that begins at `at`; 0 where none does."""
+        if at + self.header > len(data) or (self.devices and self.device(data, at) not in self.devices):
+            return 0
+        if not self.second:
+            return self._sizes.get(data[at + 10], 0) if data[at + 1] == 5 and data[at + 9] <= 5 else 0
+        kind = data[at + 17]
+        length = _LENGTH.unpack_from(data, at + 18)[0]
+        fits = data[at + 6] <= 5 and kind in self._steps and 0 < length <= 1_500
+        return self.header + length if fits and length % self._steps[kind] == 0 else 0
+
+    def device(self, data: bytes, at: int = 0) -> int:
+        """What the package calls its device."""
+        return _LENGTH.unpack_from(data, at + 1)[0] if self.second else data[at]
+
+    def kind(self, data: bytes, at: int = 0) -> int:
+        """The data type."""
+        return data[at + (17 if self.second else 10)]
+
+    def samples(self, package: bytes) -> int:
+        """How many samples a package has."""
+        return (len(package) - self.header) // self._steps[self.kind(package)]
+
+    def candidates(self, data: bytes, start: int, stop: int) -> np.ndarray:
+        """Places in [start, stop) where a package may begin."""
+        last = min(stop, len(data) - self.header + 1)
+        if last <= start:
+            return np.zeros(0, dtype=np.int64)
+        byte = np.frombuffer(data, np.uint8)
+
+        def at(offset: int) -> np.ndarray:
+            return byte[start + offset : last + offset]
+
+        if self.second:
+            fits = (at(6) <= 5) & (at(17) <= 3) & (at(19) <= 5) & (at(20) == 0) & (at(21) == 0)
+        else:
+            fits = (at(1) == 5) & (at(9) <= 5) & (at(10) <= 8)
+        return np.flatnonzero(fits) + start
+
+    def follows(self, before: bytes, data: bytes, at: int) -> bool:
+        """Whether the package at `at` is of the lidar and kind of one before, within ten seconds of it."""
+        header = self.layout.header
+        old = np.frombuffer(before, header, 1)
+        new = np.frombuffer(data, header, 1, at)
+        for name in ("index", "version", "slot", "lidar", "lidar_type", "reserved", "clock", "kind"):
+            if name in (header.names or ()) and old[name] != new[name]:
+                return False
+        clock = self.layout.clocks.get(int(old["clock"][0]), "unknown")
+        first, second = (decode_stamps(h["stamp"], clock, self.layout.version)[0] for h in (old, new))
+        if clock == "pps":
+            return 0 <= second < 1_000_000_000
+        return bool(0 < second - first <= 10_000_000_000)
+
+    def plausible(self, package: bytes) -> bool:
+        """Whether its points are such as a lidar can see, or its inertial sample such as a rig can feel."""
+        kind = self.kind(package)
+        of = self.layout.kinds[kind]
+        samples = np.frombuffer(package, of.sample, offset=self.header)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if of.form == "imu":
+                rate, force = decode_imu(samples)
+                return bool((np.abs(rate) < 100).all() and (np.abs(force) < 1_000).all())
+            return bool((np.linalg.norm(decode_points(of, samples)[0], axis=-1) <= FARTHEST_M).all())
+
+
+@dataclass
+class RawFrame:
+    """Packages between two headers of frames, as (device, data type, bytes)."""
+
+    at: int = 0
+    packages: list[tuple[int, int, bytes]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Hole:
+    """Bytes [start, stop) of the file that could not be read, and about how many packages they held.
+
+    `n_lost` is None in the middle of a file, where the stamps on both sides tell it.
+    """
+
+    start: int
+    stop: int
+    why: str
+    n_lost: int | None = None
+
+
+class Walk:
+    """One walk through a file.
+
+    Parameters
+    ----------
+    file : binary file
+    test : PackageTest
+    start : int
+        Where the first frame begins, or is thought to begin.
+    """
+
+    def __init__(self, file: BinaryIO, test: PackageTest, start: int) -> None:
+        self.holes: list[Hole] = []
+        self.n_frames = 0
+        self.n_wrong_offsets = 0
+        self._file, self._test, self._start = file, test, start
+        self._skip = test.layout.frame_bytes
+        self._data, self._base, self._ended = b"", start, False
+        self._shifts = [0]  # by how much offsets in headers differ from places in the file
+        self._index: int | None = None
+        self._frame_end = start
+        self._tail = -1  # where the last package ends
+        self._last: dict[tuple[int, int], bytes] = {}
+        self._before: tuple[tuple[int, int], bytes | None] = (0, 0), None  # what the last package replaced
+        self._bytes = self._count = 0
+
+    def frames(self) -> Iterator[RawFrame]:
+        """The packages, frame by frame; holes are noted on the way."""
+        self._file.seek(self._start)
+        frame, pos = RawFrame(self._start), self._start
+        size_of, device_of, kind_of = self._test.size, self._test.device, self._test.kind
+        while True:
+            self._reach(pos)
+            data, at = self._data, pos - self._base
+            if at >= len(data):
+                break
+            if self._strong(at):
+                header = True
+            else:
+                size = size_of(data, at)
+                if size and at + size <= len(data):
+                    if len(frame.packages) >= _MOST:
+                        yield frame
+                        frame = RawFrame(pos)
+                    package = data[at : at + size]
+                    device, kind = device_of(package), kind_of(package)
+                    frame.packages.append((device, kind, package))
+                    key = device, kind
+                    self._before, self._last[key] = (key, self._last.get(key)), package
+                    self._bytes, self._count = self._bytes + size, self._count + 1
+                    pos += size
+                    self._tail = pos
+                    continue
+                header = self._weak(at)
+            if header:
+                if frame.packages:
+                    yield frame
+                frame = RawFrame(pos)
+                self._enter(at, pos)
+                pos += self._skip
+                continue
+            pos = self._over_hole(frame, pos)
+        if frame.packages:
+            yield frame
+        if pos < self._frame_end and not (self.holes and self.holes[-1].n_lost is not None):
+            lost = self._about(self._frame_end - pos)
+            self.holes.append(Hole(pos, pos, "the file ends within a frame", lost))
+
+    def find_any(self) -> int:
+        """Where the first frame or package begins."""
+        self._file.seek(self._start)
+        return self._resync(self._start)
+
+    def find_frame(self, limit: int) -> int | None:
+        """Where the first frame with packages begins, within so many bytes of the start."""
+        pos = self._start
+        self._file.seek(pos)
+        while pos < self._start + limit:
+            pos = self._resync(pos)
+            at = pos - self._base
+            if at >= len(self._data):
+                return None
+            if self._header(at):
+                return pos
+            pos += 1
+        return None
+
+    # ------------------------------------------------------------------------------ the window
+
+    def _reach(self, pos: int) -> None:
+        """Have enough bytes of the file from `pos` on."""
+        at = pos - self._base
+        if self._ended or len(self._data) - at >= _LOOK:
+            return
+        more = self._file.read(_BLOCK)
+        self._ended = len(more) < _BLOCK
+        kept = max(at - _BEHIND, 0)
+        self._data, self._base = self._data[kept:] + more, self._base + kept
+
+    # ------------------------------------------------------------------------------ headers
+
+    def _three(self, at: int) -> tuple[int, int, int] | None:
+        if at + self._skip > len(self._data):
+            return None
+        return _THREE.unpack_from(self._data, at)
+
+    def _strong(self, at: int) -> bool:
+        """Whether a header stands here that knows its own place."""
+        three = self._three(at)
+        if three is None or three[0] - self._base - at not in self._shifts:
+            return False
+        return self._skip <= three[1] - three[0] <= _LONGEST_FRAME
+
+    def _weak(self, at: int) -> bool:
+        """Whether a header stands here whose offsets are wrong or moved: its number and what follows tell."""
+        three = self._three(at)
+        if three is None:
+            return False
+        if not self._mark(*three):
+            return False
+        return self._chain(at + self._skip, 3 if self._index is None else 2)
+
+    def _mark(self, current: int, following: int, index: int) -> bool:
+        """Whether three numbers may be those of a header: its number is the next, or its length is one."""
+        long = self._skip <= following - current <= _LONGEST_FRAME
+        if self._index is None:
+            return long and index < 10_000_000
+        step = index - self._index
+        return step == 1 or (long and 0 < step <= 10_000)
+
+    def _header(self, at: int) -> bool:
+        return self._strong(at) or self._weak(at)
+
+    def _enter(self, at: int, pos: int) -> None:
+        """Take note of the header at `at`."""
+        current, following, index = _THREE.unpack_from(self._data, at)
+        shift = current - pos
+        if shift:
+            self.n_wrong_offsets += 1
+        if shift not in self._shifts:
+            self._shifts = [0, *self._shifts[1:][-2:], shift]
+        long = self._skip <= following - current <= _LONGEST_FRAME
+        self._frame_end = pos + (following - current if long else 0)
+        self._index = index
+        self.n_frames += 1
+
+    # ------------------------------------------------------------------------------ damage
+
+    def _chain(self, at: int, links: int, crumbs: bool = True) -> bool:
+        """Whether so many packages follow one another from here on, or the file ends first.
+
+        Without `crumbs` it may not end with a few bytes that could be anything.
+        """
+        data = self._data
+        for _ in range(links):
+            if at >= len(data) or at + self._test.header > len(data):
+                return self._ended and (crumbs or at == len(data))
+            size = self._test.size(data, at)
+            if not size:
+                three = self._three(at)
+                return self._strong(at) or (three is not None and self._mark(*three))
+            at += size
+        return True
+
+    def _confirmed(self, at: int) -> bool:
+        """Whether the walk can go on from here."""
+        if self._header(at):
+            return True
+        data = self._data
+        size = self._test.size(data, at)
+        if not size or at + size > len(data):
+            return False
+        before = self._last.get((self._test.device(data, at), self._test.kind(data, at)))
+        if before is not None and self._test.follows(before, data, at):
+            return True
+        return self._chain(at + size, 2, crumbs=False)
+
+    def _resync(self, pos: int) -> int:
+        """The next place from `pos` on where the walk can go on; the end of the file if there is none."""
+        while True:
+            self._reach(pos)
+            start = pos - self._base
+            stop = len(self._data) if self._ended else len(self._data) - _LOOK // 2
+            places = np.union1d(self._test.candidates(self._data, start, stop), self._marks(start, stop))
+            for at in places.tolist():
+                if self._confirmed(at):
+                    return self._base + at
+            pos = self._base + stop
+            if self._ended:
+                return pos
+
+    def _marks(self, start: int, stop: int) -> np.ndarray:
+        """Places in [start, stop) where a header may stand."""
+        stop = min(stop, len(self._data) - self._skip + 1)
+        if stop <= start:
+            return np.zeros(0, dtype=np.int64)
+        current, following, index = (
+            np.ndarray((stop - start,), "<u8", self._data, start + offset, (1,)) for offset in (0, 8, 16)
+        )
+        length = following - current  # unsigned: backwards is very long
+        fits = (length >= np.uint64(self._skip)) & (length <= np.uint64(_LONGEST_FRAME))
+        if self._index is None:
+            fits &= index < 10_000_000
+        else:
+            step = index - np.uint64(self._index)
+            fits = (fits & (step > 0) & (step <= 10_000)) | (step == 1)
+        return np.flatnonzero(fits) + start
+
+    def _over_hole(self, frame: RawFrame, pos: int) -> int:
+        """Note what cannot be read from `pos` on; where the walk goes on."""
+        start, why = pos, self._why(pos)
+        last = frame.packages[-1][2] if frame.packages and self._tail == pos else b""
+        stop, damaged = self._within(pos, last) if last else (self._resync(pos + 1), False)
+        if damaged:
+            frame.packages.pop()
+            start -= len(last)
+            self._bytes, self._count = self._bytes - len(last), self._count - 1
+            why = "the data are damaged"
+        at_end = stop - self._base >= len(self._data)
+        lost = None
+        if at_end:
+            known = start < self._frame_end or stop - start >= self._skip  # else: a header is cut
+            lost = self._about(max(stop, self._frame_end) - start) if known else 0
+        elif not self._count:
+            lost = self._about(stop - start)
+        self.holes.append(Hole(start, stop, why, lost))
+        self._frame_end = 0  # bytes may have come or gone
+        return stop
+
+    def _within(self, pos: int, last: bytes) -> tuple[int, bool]:
+        """Where the walk can go on, and whether the package before `pos` is damaged.
+
+        Where bytes are missing it reaches too far, so the search begins within it.
+        """
+        key, before = self._before
+        if before is None:
+            del self._last[key]
+        else:
+            self._last[key] = before
+        stop = self._resync(pos - len(last) + 1)
+        plausible = self._test.plausible(last)
+        at = stop - self._base
+        if plausible and stop < pos and not self._strong(at) and self._weak(at):
+            stop = self._resync(pos + 1)  # a damaged header may seem to begin too early
+        damaged = stop < pos or not plausible
+        if not damaged:
+            self._last[key] = last
+        return stop, damaged
+
+    def _about(self, n_bytes: int) -> int:
+        """About how many packages so many bytes hold: at least one."""
+        mean = self._bytes / self._count if self._count else self._test.header + 1_344
+        return max(1, round(n_bytes / mean))
+
+    def _why(self, pos: int) -> str:
+        """What is wrong here, in a few words."""
+        data, at = self._data, pos - self._base
+        if self._test.size(data, at) or (self._ended and at + self._test.header > len(data)):
+            return "the file ends within a package"
+        if not self._test.second and at + self._test.header <= len(data):
+            version, changed = data[at + 1], bytearray(data[at : at + self._test.header])
+            changed[1] = 5
+            if version != 5 and any(changed[5:]) and self._test.size(bytes(changed), 0):
+                return f"a package of version {version}; only version 5 is known"
+        return "neither a package nor a frame begins here"
