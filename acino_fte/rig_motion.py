@@ -126,8 +126,10 @@ def _followed(time: np.ndarray, value: np.ndarray) -> Angle:
     swing = BPoly.from_derivatives([start - SWING, start], [[rest, 0.0, 0.0], [first, speed, change]])
 
     def angle(t: np.ndarray) -> np.ndarray:
-        early = np.where(t > start - SWING, swing(np.clip(t, start - SWING, start)), rest)
-        return np.where(t < start, early, track(np.clip(t, start, None)))
+        out = np.full(np.shape(t), rest)
+        early, late = (t > start - SWING) & (t < start), t >= start
+        out[early], out[late] = swing(t[early]), track(t[late])
+        return out
 
     return angle
 

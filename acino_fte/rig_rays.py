@@ -42,15 +42,18 @@ def ray_spheres(
 ) -> np.ndarray:
     """Distances (K, B) to spheres about `centre` (B, 3) or (K, B, 3), of `radius` (B,)."""
     if centre.ndim == 2:  # the same spheres for all rays: products of matrices
-        b = _dot(origin, direction)[:, None] - direction @ centre.T
-        squared = _dot(origin, origin)[:, None] - 2 * origin @ centre.T + _dot(centre, centre)
+        ahead = direction @ centre.T - _dot(origin, direction)[:, None]
+        squared = _dot(origin, origin)[:, None] - 2 * origin @ centre.T + (_dot(centre, centre) - radius**2)
     else:
         offset = origin[:, None] - centre
-        b, squared = _dot(offset, direction[:, None]), _dot(offset, offset)
-    root = b**2 - (squared - radius**2)
-    with np.errstate(invalid="ignore"):
-        near = -b - np.sqrt(root)
-    return np.where((root >= 0) & (near >= 0), near, np.inf)
+        ahead, squared = -_dot(offset, direction[:, None]), _dot(offset, offset) - radius**2
+    root = ahead * ahead
+    root -= squared
+    near = np.full(root.shape, np.inf)
+    met = root >= 0
+    near[met] = ahead[met] - np.sqrt(root[met])
+    near[near < 0] = np.inf
+    return near
 
 
 def ray_level(origin: np.ndarray, direction: np.ndarray, height: np.ndarray) -> np.ndarray:
