@@ -8,7 +8,8 @@ import numpy as np
 
 _WINDOW = 15  # messages on either side
 _RANK = 2  # the third least of them: two that are too early do not matter
-_LEAST_NS = 2e6  # smaller jumps are wander
+LEAST_JUMP_NS = 2e6
+"""Smaller jumps count as wander, ns."""
 _SIGMAS = 8.0
 _DRIFT = 1e-4  # of two clocks, at worst
 _STALL_NS = (
@@ -23,31 +24,36 @@ class Piece:
     rows: np.ndarray
 
 
-def find_pieces(device: np.ndarray, received: np.ndarray) -> tuple[list[Piece], int]:
+def find_pieces(device: np.ndarray, received: np.ndarray, jumps: bool = True) -> tuple[list[Piece], int]:
     """Stretches between jumps, and how many messages belong to none.
 
     Parameters
     ----------
     device, received : (K,) int64
         Stamps by either clock, in the order of the recording.
+    jumps : bool
+        Whether to look for jumps; else there is one stretch.
     """
     level = ((received - received[0]) - (device - device[0])).astype(float)
     time = (received - received[0]).astype(float)
-    cuts = _restarts(device)
-    edges = [0, *cuts, len(device)]
-    bounds = set(edges)
     scale = _noise(level)
-    for start, stop in zip(edges, edges[1:], strict=False):
-        bounds.update(start + c for c in _jumps(level[start:stop], time[start:stop], scale))
-    edges = sorted(bounds)
-    parts = [np.arange(a, b) for a, b in zip(edges, edges[1:], strict=False)]
-    parts = _joined(parts, level, time, scale)
+    parts = _parts(device, level, time, scale) if jumps else [np.arange(len(device))]
     pieces, n_out = [], len(device) - sum(map(len, parts))
     for rows in parts:
         good = _not_early(level[rows], time[rows], scale)
         n_out += int((~good).sum())
         pieces.append(Piece(rows[good]))
     return pieces, n_out
+
+
+def _parts(device: np.ndarray, level: np.ndarray, time: np.ndarray, scale: float) -> list[np.ndarray]:
+    """Rows of every stretch between jumps."""
+    edges = [0, *_restarts(device), len(device)]
+    bounds = set(edges)
+    for start, stop in zip(edges, edges[1:], strict=False):
+        bounds.update(start + c for c in _jumps(level[start:stop], time[start:stop], scale))
+    edges = sorted(bounds)
+    return _joined([np.arange(a, b) for a, b in zip(edges, edges[1:], strict=False)], level, time, scale)
 
 
 def _noise(level: np.ndarray) -> float:
@@ -95,7 +101,7 @@ def _jumps(level: np.ndarray, time: np.ndarray, scale: float) -> list[int]:
     step = _steps(level, window)
     middle = (window - 1) // 2
     apart = time[window + middle : window + middle + len(step)] - time[middle : middle + len(step)]
-    size = np.abs(step) / (max(_SIGMAS * scale, _LEAST_NS) + _DRIFT * np.maximum(apart, 0.0))
+    size = np.abs(step) / (max(_SIGMAS * scale, LEAST_JUMP_NS) + _DRIFT * np.maximum(apart, 0.0))
     cuts = []
     while len(size) and size.max() > 1:
         i = int(size.argmax())
@@ -124,7 +130,7 @@ def _place(level: np.ndarray, i: int, window: int) -> int:
 
 def _joined(parts: list[np.ndarray], level: np.ndarray, time: np.ndarray, scale: float) -> list[np.ndarray]:
     """Join stretches that agree over a short one, whose messages were held up."""
-    limit = max(_SIGMAS * scale, _LEAST_NS)
+    limit = max(_SIGMAS * scale, LEAST_JUMP_NS)
 
     def agree(a: np.ndarray, b: np.ndarray) -> bool:
         near_a, near_b = a[-_WINDOW:], b[:_WINDOW]

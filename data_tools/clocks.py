@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from acino_fte.data_tools.clock_jumps import Piece, find_pieces
+from acino_fte.data_tools.clock_jumps import LEAST_JUMP_NS, Piece, find_pieces
 from acino_fte.errors import InputError
 
 JumpKind = Literal["restart", "wrap", "device", "computer"]
@@ -184,13 +184,15 @@ def same_clock() -> DeviceClock:
     return DeviceClock(0.0, 0.0, (piece,))
 
 
-def fit_clock(device_ns: np.ndarray, received_ns: np.ndarray) -> DeviceClock:
+def fit_clock(device_ns: np.ndarray, received_ns: np.ndarray, *, jumps: bool = True) -> DeviceClock:
     """Fit a device's stamps to the times at which its messages were received.
 
     Parameters
     ----------
     device_ns, received_ns : (K,) int64
         Of every message, in the order of the recording. K ≥ 3.
+    jumps : bool
+        Whether the clock can jump. One that counts events cannot.
 
     Raises
     ------
@@ -216,13 +218,20 @@ def fit_clock(device_ns: np.ndarray, received_ns: np.ndarray) -> DeviceClock:
             remedy="use the times of reception",
         )
     rows = np.flatnonzero(fresh)
-    pieces, n_late = find_pieces(device[rows], received[rows])
-    drift, drift_sd, lines, delay = _fit_lines(device[rows], received[rows], pieces)
+    pieces, n_late = find_pieces(device[rows], received[rows], jumps)
+    while True:
+        drift, drift_sd, lines, delay = _fit_lines(device[rows], received[rows], pieces)
+        found = _jumps(lines, drift, device[rows], received[rows], pieces)
+        small = [i for i, jump in enumerate(found) if abs(jump.size_ns) < _least_jump(lines[i : i + 2])]
+        if not small:
+            break
+        i = small[0]
+        pieces[i : i + 2] = [Piece(np.concatenate([pieces[i].rows, pieces[i + 1].rows]))]
     return DeviceClock(
         drift=drift,
         drift_sd=drift_sd,
         pieces=lines,
-        jumps=_jumps(lines, drift, device[rows], received[rows], pieces),
+        jumps=found,
         delay_ms=float(np.median(delay)) * 1e-6,
         n_duplicates=int((~fresh).sum()),
         n_outliers=n_late,
@@ -309,7 +318,9 @@ def _drift(points: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
             total += n * (mean_y - b * mean_x - float((y - b * x).min()))
         return total
 
-    slopes = np.unique(np.concatenate([np.diff(y) / np.diff(x) for x, y in hulls if len(x) > 1] or [[0.0]]))
+    slopes = np.unique(
+        np.concatenate([np.diff(y) / np.diff(x) for x, y in hulls if len(x) > 1] or [np.zeros(1)])
+    )
     slopes = slopes[np.abs(slopes) <= _MAX_DRIFT]
     if len(slopes) == 0:
         return float(minimize_scalar(cost, bounds=(-_MAX_DRIFT, _MAX_DRIFT), method="bounded").x)
@@ -370,12 +381,17 @@ def _jumps(
     out = []
     step = float(np.median(np.abs(np.diff(device))))
     for before, after, a, b in zip(pieces, pieces[1:], parts, parts[1:], strict=False):
-        predicted = int(before.at(np.int64(after.origin_ns), drift))
+        predicted = int(before.at(np.array(after.origin_ns), drift))
         size = round((predicted - after.base_ns) / (1 + drift))
         d_device = int(device[b.rows[0]]) - int(device[a.rows[-1]])
         d_received = int(received[b.rows[0]]) - int(received[a.rows[-1]])
         out.append(Jump(int(received[b.rows[0]]), size, _kind(size, d_device, d_received, step)))
     return tuple(out)
+
+
+def _least_jump(lines: Sequence[ClockPiece]) -> float:
+    """What a jump between two pieces must exceed, ns."""
+    return max(LEAST_JUMP_NS, 3e6 * float(np.hypot(lines[0].sd_ms, lines[1].sd_ms)))
 
 
 def _kind(size: int, d_device: int, d_received: int, step: float) -> JumpKind:
