@@ -39,6 +39,7 @@ _LEAST_BULGE = 0.3
 _SLOPE = 0.15  # of the way from a return to its marker along the link, as depth that the pose may be wrong by
 _SCAN = 0.1  # s: what the thesis takes for one frame of the lidar
 _NEAREST_SD = 0.05  # m, of the thesis's way
+_MARGIN = 0.1  # of the picture's size: how far outside it returns still count
 _WIDEST = 0.5  # m: σ_f is never more
 
 
@@ -82,6 +83,7 @@ def associate(
     sequence : Sequence
         With a lidar.
     skeleton : Skeleton
+        The species.
     positions : (N, M, 3)
         Where the markers are, as far as is known, m.
     surface : (M,)
@@ -119,6 +121,26 @@ def associate(
         places = (found.frame, found.start, found.end, found.along, found.bulge)
         return DepthData(camera.name, BodyReturns(*places, found.depth, sd))
     return DepthData(camera.name, marker_depths(lidar, found, local, surface, rate))
+
+
+def in_view(sequence: Sequence) -> Sequence:
+    """The same sequence with only the returns before its camera's picture, with a margin."""
+    lidar = sequence.lidar
+    if lidar is None or not len(lidar):
+        return sequence
+    camera = sequence.cameras[lidar.camera]
+    width, height = camera.resolution
+    edge = np.linspace(0.0, 1.0, 9)
+    border = np.concatenate([np.stack([edge, np.full(9, v)], 1) for v in (0.0, 1.0)])
+    border = np.concatenate([border, border[:, ::-1]]) * [width, height]
+    flat = camera.undistort(border)
+    margin = _MARGIN * np.ptp(flat, axis=0)
+    local = lidar.to_camera()
+    ahead = local[:, 2] > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen = local[:, :2] / local[:, 2:]
+    keep = ahead & ((seen >= flat.min(0) - margin) & (seen <= flat.max(0) + margin)).all(-1)
+    return replace(sequence, lidar=lidar.select(keep))
 
 
 def attach(

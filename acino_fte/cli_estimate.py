@@ -108,6 +108,7 @@ def estimate_source(
 def load(source: Source, options: EstimateOptions) -> tuple[Sequence, Kinematics]:
     """The sequence, and the kinematics of its species; what SymPy must derive is derived here."""
     from acino_fte.data_tools.load import load_sequence
+    from acino_fte.depth import depth_residual
     from acino_fte.kinematics import load_kinematics
     from acino_fte.parameters import FAMILIES, KINEMATIC
     from acino_fte.residuals import lower
@@ -125,6 +126,8 @@ def load(source: Source, options: EstimateOptions) -> tuple[Sequence, Kinematics
     kinematics = load_kinematics(load_skeleton(sequence.species))
     fit = FAMILIES if options.fit is None else options.fit
     kinematics.with_parameters(f for f in fit if f in KINEMATIC)
+    if sequence.lidar is not None:
+        lower(depth_residual(surface=options.association != "nearest"))
     if options.fit is None:
         kinematics.with_parameters(("scale",))  # what is fitted, as a rule, of what is looked at
     for model in {camera.model for camera in sequence.cameras}:
@@ -225,6 +228,12 @@ def describe(sequence: Sequence, result: FTEResult) -> None:
         stdout.print(
             f"reprojection error: median {error['median']:.1f} px, "
             f"{100 * error['within_20px']:.1f} % within 20 px"
+        )
+    depth = metrics.get("depth_m")
+    if depth and depth["n"]:
+        stdout.print(
+            f"depth: {depth['n']} measurements, median {1e3 * depth['median']:.0f} mm from the surface, "
+            f"{100 * depth['outlier_ratio']:.1f} % beyond 3 standard deviations"
         )
     for key, name in (("heldout_px", "cross-fitted"), ("heldout_nominal_px", "given calibration")):
         held = metrics.get(key)

@@ -24,6 +24,13 @@ class _Noise(StrEnum):
     table = "table"
 
 
+class _Association(StrEnum):
+    marker = "marker"
+    body = "body"
+    nearest = "nearest"
+    none = "none"
+
+
 class _Lowering(StrEnum):
     condensed = "condensed"
     explicit = "explicit"
@@ -106,6 +113,13 @@ def run(
             "--contact", help="Keep paws above the ground, and still in stance.", rich_help_panel=_PROBLEM
         ),
     ] = False,
+    association: Annotated[
+        _Association,
+        typer.Option(
+            help="Depth from a lidar: at markers, of the whole body, the nearest return (thesis), or none.",
+            rich_help_panel=_PROBLEM,
+        ),
+    ] = _Association.marker,
     tune_noise: Annotated[
         bool,
         typer.Option(
@@ -207,6 +221,7 @@ def run(
             tune_noise,
             covariance,
             lowering.value,
+            association.value,
         )
         source = Source(sequence, out, species, fps, frame_range(frames))
         result, target = estimate_source(source, method.value, options, holdout_cameras, ladder, quiet)

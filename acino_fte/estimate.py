@@ -23,7 +23,7 @@ import numpy as np
 
 from acino_fte.arrow import NotPositiveDefinite
 from acino_fte.assignments import Assignment, resolve
-from acino_fte.association import ASSOCIATIONS
+from acino_fte.association import ASSOCIATIONS, in_view
 from acino_fte.contact import contact_terms
 from acino_fte.diagnosis import diagnose
 from acino_fte.errors import InputError
@@ -155,7 +155,7 @@ class _Estimate:
         progress: Progress | None,
         seconds: dict[str, float],
     ) -> None:
-        self.sequence, self.kinematics, self.options = sequence, kinematics, options
+        self.sequence, self.kinematics, self.options = in_view(sequence), kinematics, options
         self.progress = progress
         self.seconds = dict(seconds)
         self.skeleton = kinematics.skeleton
@@ -165,7 +165,7 @@ class _Estimate:
         self.fit: tuple[str, ...] = ()
         self.assignment: Assignment | None = None
         self.extra: tuple[Term, ...] = ()
-        self.fuse = Fusion(sequence, self.skeleton, self.options.association, self.detected)
+        self.fuse = Fusion(self.sequence, self.skeleton, self.options.association, self.detected)
         self.findings: list[str] = []
         self.contacts: list[str] = []
         self.iterations = 0

@@ -62,5 +62,8 @@ class Lidar:
 
     def between(self, start: float, stop: float) -> Lidar:
         """The returns with start ≤ time < stop, s."""
-        keep = (self.time >= start) & (self.time < stop)
+        return self.select((self.time >= start) & (self.time < stop))
+
+    def select(self, keep: np.ndarray) -> Lidar:
+        """Some of the returns: a mask (K,) or rows."""
         return replace(self, time=self.time[keep], xyz=self.xyz[keep], intensity=self.intensity[keep])

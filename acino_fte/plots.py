@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import matplotlib
 
 from acino_fte.parameter_table import parameter_tables
+from acino_fte.plots_depth import depth_figure
 from acino_fte.plots_histograms import camera_figure, error_figure, marker_figure
 from acino_fte.plots_joints import joint_figure, motion_figure
 from acino_fte.plots_ladder import ladder_figure
@@ -34,6 +35,7 @@ FIGURES: dict[str, tuple[str, Callable[[FTEResult], Figure]]] = {
     "reprojection_error": ("Reprojection error", error_figure),
     "reprojection_by_camera": ("Reprojection error by camera", camera_figure),
     "reprojection_by_marker": ("Reprojection error by marker", marker_figure),
+    "depth": ("Depth measured by the lidar", depth_figure),
     "joint_angles": ("Joint angles and their limits", joint_figure),
     "marker_positions": ("Positions of the markers", position_figure),
     "uncertainty": ("Uncertainty of the markers", uncertainty_figure),
@@ -48,13 +50,14 @@ FIGURES: dict[str, tuple[str, Callable[[FTEResult], Figure]]] = {
 def figures_of(result: FTEResult) -> list[str]:
     """Names of the figures that have something to show of a result.
 
-    ``joint_angles`` needs joints, ``uncertainty`` covariances, ``parameters`` estimated parameters and
-    ``ladder`` a ladder of cameras left out;
+    ``joint_angles`` needs joints, ``uncertainty`` covariances, ``parameters`` estimated parameters,
+    ``depth`` a lidar, and ``ladder`` a ladder of cameras left out;
     ``marker_positions`` is for the methods without joints, and for error bands.
     """
     joints, spread = bool(result.q.shape[1]), result.position_covariance is not None
     shown = {"joint_angles": joints, "marker_positions": spread or not joints, "uncertainty": spread}
     shown["parameters"] = bool(parameter_tables(result.parameters))
+    shown["depth"] = result.depth is not None
     shown["ladder"] = bool(result.evaluation.get("ladder"))
     return [name for name in FIGURES if shown.get(name, True)]
 

@@ -27,8 +27,11 @@ if TYPE_CHECKING:
 
     from acino_fte.result import FTEResult
 
-FILES = ("fte.nc", "positions.csv", "states.csv", "metrics.json", "sequence.yaml", "figures", "report.html")
-"""What a result folder may hold; ``states.csv`` only from a method with a skeleton."""
+FILES = (
+    *("fte.nc", "positions.csv", "states.csv", "depth.csv", "metrics.json"),
+    *("sequence.yaml", "figures", "report.html"),
+)
+"""What a result folder may hold; ``states.csv`` only with a skeleton, ``depth.csv`` only with a lidar."""
 _ANOTHER = "choose another output folder with -o"
 
 
@@ -216,6 +219,8 @@ def write_tables(result: FTEResult, folder: Path) -> None:
     _write_positions(result, folder / "positions.csv")
     if result.q.shape[1]:
         _write_states(result, folder / "states.csv")
+    if result.depth is not None:
+        depth_table(result).to_csv(folder / "depth.csv", index=False, float_format="%.6f")
     text = json.dumps(result.metrics, indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
     provenance = yaml.safe_dump(
@@ -249,6 +254,26 @@ def positions_table(result: FTEResult) -> pd.DataFrame:
         sd = np.sqrt(np.maximum(variance, 0.0))
         columns |= {f"sd_{axis}": sd[..., i].ravel() for i, axis in enumerate("xyz")}
     return pd.DataFrame(columns)
+
+
+def depth_table(result: FTEResult) -> pd.DataFrame:
+    """Columns frame, time_s, marker, measured, predicted, sd (m, along the camera's axis) and returns."""
+    import pandas as pd
+
+    depth = result.depth
+    assert depth is not None
+    frames = np.asarray(result.sequence.frames)[depth.frame]
+    return pd.DataFrame(
+        {
+            "frame": frames,
+            "time_s": frames / result.sequence.fps,
+            "marker": np.array(result.skeleton.marker_names)[depth.marker],
+            "measured": depth.measured,
+            "predicted": depth.predicted,
+            "sd": depth.sd,
+            "returns": depth.count,
+        }
+    )
 
 
 def _write_states(result: FTEResult, path: Path) -> None:

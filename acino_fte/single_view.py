@@ -4,12 +4,13 @@ A link of length L that is seen under the angle α (in the normalised image) is 
 at less where it is foreshortened: the distance of the animal is a low quantile of L/α over its links. Returns
 of a lidar that lie on the drawn skeleton have one depth in common up to a factor of that; the rest is
 background. Detections at that depth (the thesis's back-projected pseudo-RGB-D) give position and heading. An
-image alone does not tell an animal that turns a little towards the camera from one that turns away, and hardly
-one from its mirror image: each heading is fitted on a part of the frames, and the best is kept.
+image alone does not tell an animal that turns a little towards the camera from one that turns away, and
+hardly one from its mirror image: each heading is fitted on a part of the frames, and the best is kept.
 """
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -39,6 +40,8 @@ _FLAT_SD = 0.5  # m, of the depth of a marker that is only known to belong to th
 _MOST = 40  # frames in a start
 _ON_BODY = 0.06  # m: returns so near to the drawn skeleton are on the animal, as a rule
 _TOLERANCE = 0.6  # m: half the depth of an animal and its lean
+_ENOUGH = 3e-3  # relative decrease of the objective per iteration below which the start is good enough
+_ITERATIONS = 25  # a right heading is there after ten
 _SIZES = (0.6, 1.6)  # how far from the species' size an animal may be
 
 
@@ -165,6 +168,13 @@ def _returns_on_skeleton(
     likely = (local[:, 2] > _SIZES[0] * size[frame]) & (local[:, 2] < _SIZES[1] * size[frame])
     frame, local = frame[likely], local[likely]
     seen = local[:, :2] / local[:, 2:]
+    seen = local[:, :2] / local[:, 2:]
+    margin = (_ON_BODY / size)[:, None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # frames without any detection
+        lower, upper = np.nanmin(flat, axis=1) - margin, np.nanmax(flat, axis=1) + margin
+    boxed = ((seen >= lower[frame]) & (seen <= upper[frame])).all(-1)
+    frame, local, seen = frame[boxed], local[boxed], seen[boxed]
     links = np.array(skeleton.edges).reshape(-1, 2)
     nearest = np.full(len(frame), np.inf)
     for a, b in links:
@@ -218,11 +228,8 @@ def _fit(
     assert term is not None
     terms = [term, *_depth_terms(sequence, kinematics, camera, pixels, depth, start)]
     problem = build_problem(kinematics, sequence.fps, sequence.frames, terms, options)
-    settings = SolveOptions(max_iter=60, tolerance=1.0, acceptable_tolerance=10.0)
+    settings = SolveOptions(max_iter=_ITERATIONS, tolerance=1.0, acceptable_tolerance=10.0)
     return minimise(problem, start, settings, enough=_ENOUGH)
-
-
-_ENOUGH = 3e-3  # relative decrease of the objective per iteration below which the start is good enough
 
 
 def _depth_terms(

@@ -240,6 +240,7 @@ _STRATEGY: dict[str, str | float | int] = {
     "bound_push": 1e-2,
     "bound_frac": 1e-2,
     "mumps_mem_percent": 50,  # enough without delayed pivots; IPOPT enlarges it when it is not
+    "mumps_pivot_order": 6,  # minimum degree that knows dense rows: parameters stand in every frame
     "mumps_permuting_scaling": 0,  # the Hessian is positive semidefinite and well scaled as it is
     "mumps_scaling": 0,
 }

@@ -78,6 +78,11 @@ def load_sequence(
     parameters = {}
     if file.truth_parameters:
         parameters = read_truth_parameters(file.truth_parameters, skeleton, cameras.names, n_frames)
+    lidar = None
+    if file.lidar is not None:
+        from acino_fte.data_tools.sequence_lidar import read_lidar
+
+        lidar = read_lidar(file.lidar, cameras, source)
     folder = source.parent if source.is_file() else source
     name = file.name or folder.resolve().name
     sequence = Sequence(
@@ -89,6 +94,7 @@ def load_sequence(
         truth=truth,
         ground=file.ground.plane if file.ground else None,
         truth_parameters=parameters,
+        lidar=lidar,
         provenance={**file.to_dict(), "name": name},
         warnings=tuple(warnings),
     )

@@ -38,6 +38,29 @@ class Ground(BaseModel):
         return a, b, c, self.height
 
 
+class LidarEntry(BaseModel):
+    """A lidar that is calibrated to one of the cameras."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    camera: str = Field(description="the camera that it is calibrated to")
+    returns: str = Field(
+        description=".npz with time (s since frame 0), xyz (m, the lidar's frame), intensity"
+    )
+    calibration: str = Field(description="file with lidar_to_camera, as calibrate_lidar.py writes it")
+    direction: Literal["lidar_to_camera", "camera_to_lidar"] | None = Field(
+        None, description="which way the calibration goes, where its file does not say so"
+    )
+    range_sd: float = Field(0.02, gt=0, description="standard deviation of a range, m")
+    time_sd_ms: float = Field(0.0, ge=0, description="standard deviation of the synchronisation, ms")
+
+    @field_validator("camera", mode="before")
+    @classmethod
+    def _text(cls, value: Any) -> Any:
+        """YAML reads a camera called 1 as a number."""
+        return str(value) if isinstance(value, int) else value
+
+
 class SequenceFile(BaseModel):
     """The content of a ``sequence.yaml``. Paths are relative to the folder of the file."""
 
@@ -58,6 +81,7 @@ class SequenceFile(BaseModel):
         None, description="JSON with true time offsets, camera poses, proportions and swaps (simulations)"
     )
     ground: Ground | None = Field(None, description="the plane that the animal stands on")
+    lidar: LidarEntry | None = Field(None, description="a lidar beside one of the cameras")
 
     @field_validator("keypoints", mode="before")
     @classmethod
@@ -91,7 +115,7 @@ class SequenceFile(BaseModel):
         species = self.species
         if species is not None and species.endswith((".yaml", ".yml")):
             species = absolute(species)
-        update = {
+        update: dict[str, Any] = {
             "species": species,
             "cameras": absolute(self.cameras),
             "keypoints": {name: absolute(path) for name, path in self.keypoints.items()},
@@ -100,6 +124,9 @@ class SequenceFile(BaseModel):
             if self.truth_parameters is not None
             else None,
         }
+        if self.lidar is not None:
+            paths = {key: absolute(getattr(self.lidar, key)) for key in ("returns", "calibration")}
+            update["lidar"] = self.lidar.model_copy(update=paths)
         return self.model_copy(update=update)
 
     def to_dict(self) -> dict[str, Any]:
