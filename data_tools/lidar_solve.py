@@ -16,7 +16,7 @@ from acino_fte.cameras import Camera
 from acino_fte.data_tools.lidar_camera import LidarCamera
 from acino_fte.data_tools.lidar_pairs import LidarPairs
 from acino_fte.data_tools.lidar_solve_advice import advice, focal_and_depth
-from acino_fte.data_tools.lidar_solve_fit import OUTLIER, Fit, at, inverse, robust_fit
+from acino_fte.data_tools.lidar_solve_fit import OUTLIER, Fit, at, inverse, polished, robust_fit
 from acino_fte.data_tools.lidar_solve_holdout import choose_lens, left_out
 from acino_fte.data_tools.lidar_solve_model import POSE, PickNoise, Priors
 from acino_fte.data_tools.lidar_solve_start import starts
@@ -24,9 +24,10 @@ from acino_fte.errors import InputError
 
 FIT = {"f": ("log_f",), "aspect": ("log_aspect",), "c": ("cx", "cy"), "distortion": ("k1", "k2")}
 """What can be asked for, and the parameters that it frees."""
-RIG, ANYWHERE = 1.0, 50.0
+RIG, ANYWHERE = 0.5, 50.0
 """How far a camera is from its lidar, m (standard deviation of each coordinate): on a rig, or anywhere."""
-_CENTRE = 0.03  # how far the principal point is from the middle, in widths of the image
+_CENTRE = 0.02  # how far the principal point is from the middle, in widths of the image
+_FINALISTS = 2  # starts that are followed to the end
 _LENS = {"log_aspect": 0.02, "k1": 0.5, "k2": 1.0}
 
 
@@ -140,7 +141,7 @@ def solve_lidar_camera(
         The focal length, px, known from the lens: held, or with its standard deviation a prior.
     rig_m : float, optional
         About how far the camera may be from the lidar, m (standard deviation of each coordinate). Unless
-        told, 1 m and 50 m are both tried, and the pairs choose.
+        told, 0.5 m and 50 m are both tried, and the pairs choose.
     name : str
         Of the camera, where `camera` is not given.
 
@@ -287,27 +288,28 @@ def _best_fit(
     priors: Priors,
 ) -> Fit:
     """The best of the least squares from all starts."""
-    fits = [robust_fit(guess, names, pixel, xyz, noise, priors) for guess in guesses]
-    if not fits:
+    problem = (names, pixel, xyz, noise, priors)
+    rough = [robust_fit(guess, *problem, rough=True) for guess in guesses]
+    if not rough:
         raise InputError(
             "No pose was found that these pairs agree with.",
             remedy="check that pixels and points belong together and that all images have one zoom",
         )
-    return min(fits, key=_evidence)
+    fits = [robust_fit(fit.camera, *problem) for fit in sorted(rough, key=lambda fit: fit.scale)[:_FINALISTS]]
+    return min((polished(fit.camera, *problem, fit.scale) for fit in fits), key=_evidence)
 
 
 def _evidence(fit: Fit) -> float:
     """Twice the negative logarithm of how likely the pairs are, but for a constant.
 
     Gaussian with the scale of the fit for pairs that count, a constant for outliers; what was known before
-    with its normalisation, so that 1 m and 50 m may be compared (MacKay 2003, section 28.1).
+    with its normalisation, so that 0.5 m and 50 m may be compared (MacKay 2003, section 28.1).
     """
     off, weight = fit.priors.terms(fit.camera, fit.names)
     known = weight > 0
     each = np.minimum(fit.squared / fit.scale**2, OUTLIER)
     n = len(fit.weight)
-    volume = -2.0 * np.log(weight[known]).sum() * -1.0
-    return float(each.sum() + 4.0 * n * np.log(fit.scale) + off @ off - volume)
+    return float(each.sum() + 4.0 * n * np.log(fit.scale) + off @ off - 2.0 * np.log(weight[known]).sum())
 
 
 def _calibration(

@@ -6,7 +6,8 @@ from the pairs themselves, by the median first and from all that are no outliers
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,11 +23,12 @@ from acino_fte.data_tools.lidar_solve_model import (
 
 CAUCHY = 2.4
 """Where Cauchy's weight is a half, in units of the noise: 95 % efficient for Gaussian errors."""
-OUTLIER = 13.82
-"""Squared distance beyond which a pair is an outlier, in units of the noise: χ² of 2, 0.1 %."""
+OUTLIER = 4.685**2
+"""Squared distance beyond which a pair is an outlier, in units of the noise: Tukey's constant, squared."""
 _MEDIAN = 1.386  # of χ² with 2 degrees of freedom
 _LEAST = 0.03  # of the scale: nobody picks better than so many of the assumed standard deviations
 _PRIOR_PAIRS = 2.0  # how many pairs the assumed size of the noise counts for
+_ROUGH, _NEAR = 0.1, 1e-5  # steps, in standard deviations of the parameters, that end a search
 _FAR = 1e6  # squared distance of a pair that the camera cannot see
 
 
@@ -111,51 +113,54 @@ def robust_fit(
     noise: PickNoise,
     priors: Priors,
     *,
-    polish: bool = True,
+    rough: bool = False,
 ) -> Fit:
-    """The robust least squares from a start.
+    """The robust least squares from a start: Cauchy's loss with the scale of the median.
 
-    Cauchy's loss with the scale of the median finds the pairs that belong together. Then the others are left
-    out, and the rest is plain least squares (`polish`), until no pair changes sides.
+    `rough`: only as far as it takes to tell good starts from bad ones.
     """
     problem = (names, pixel, xyz, noise, priors)
     fit = at(camera, *problem)
     scale = median_scale(fit.squared, len(names))
-    for _ in range(12):
-        fit = _descend(fit, problem, lambda d2, s=scale: 1.0 / (1.0 + d2 / (CAUCHY * s) ** 2), scale)
+    for _ in range(4 if rough else 12):
+        steps, near = (10, _ROUGH) if rough else (60, _NEAR)
+        fit = _descend(
+            fit, problem, lambda d2, s=scale: 1.0 / (1.0 + d2 / (CAUCHY * s) ** 2), scale, steps, near
+        )
         last, scale = scale, median_scale(fit.squared, len(names))
-        if abs(scale - last) < 0.02 * last:
+        if abs(scale - last) < 0.03 * last:
             break
-    fit = _replace(fit, weight=1.0 / (1.0 + fit.squared / (CAUCHY * scale) ** 2), scale=scale)
-    return _polished(fit, problem, scale) if polish else fit
+    return replace(fit, weight=1.0 / (1.0 + fit.squared / (CAUCHY * scale) ** 2), scale=scale)
 
 
-def _polished(fit: Fit, problem: tuple, scale: float) -> Fit:
-    """Plain least squares of the pairs that are no outliers."""
-    kept = fit.squared < OUTLIER * scale**2
-    seen = set()
-    for _ in range(15):
-        kept = _enough(kept, fit.squared, len(fit.names))
-        seen.add(kept.tobytes())
-        fixed = kept.astype(float)
-        fit = _descend(fit, problem, lambda _, w=fixed: w, scale)
-        scale = final_scale(fit.squared, kept, len(fit.names))
-        least = max(scale, 0.5 * median_scale(fit.squared, len(fit.names)))
-        now = fit.squared < OUTLIER * least**2
-        if now.tobytes() in seen:
+def polished(
+    camera: Camera,
+    names: tuple[str, ...],
+    pixel: np.ndarray,
+    xyz: np.ndarray,
+    noise: PickNoise,
+    priors: Priors,
+    scale: float,
+) -> Fit:
+    """The least squares with a redescending weight: pairs far off do not count at all.
+
+    Tukey's biweight (Beaton and Tukey 1974) with its scale found together with the parameters.
+    """
+    problem = (names, pixel, xyz, noise, priors)
+    fit = at(camera, *problem)
+    for _ in range(20):
+        fit = _descend(fit, problem, lambda d2, s=scale: _biweight(d2, s, len(names)), scale, 60, _NEAR)
+        last, scale = scale, final_scale(fit.squared, fit.weight > 0, len(names))
+        if abs(scale - last) < 0.003 * last:
             break
-        kept = now
-    return _replace(fit, weight=kept.astype(float), scale=scale)
+    return replace(fit, weight=_biweight(fit.squared, scale, len(names)), scale=scale)
 
 
-def _enough(kept: np.ndarray, squared: np.ndarray, n_parameters: int) -> np.ndarray:
-    """Never fewer pairs than half of them, nor than there are unknowns."""
-    least = min(len(kept), max((len(kept) + 1) // 2, (n_parameters + 1) // 2 + 1))
-    if kept.sum() >= least:
-        return kept
-    out = np.zeros_like(kept)
-    out[np.argsort(squared)[:least]] = True
-    return out
+def _biweight(squared: np.ndarray, scale: float, n_parameters: int) -> np.ndarray:
+    """Weights (P,): (1 − d²/c²)², and 0 beyond; never of fewer pairs than half, nor than unknowns ask for."""
+    least = min(len(squared), max((len(squared) + 1) // 2, (n_parameters + 1) // 2 + 1))
+    limit = max(OUTLIER * scale**2, 1.5 * float(np.partition(squared, least - 1)[least - 1]))
+    return np.maximum(1.0 - squared / limit, 0.0) ** 2
 
 
 def median_scale(squared: np.ndarray, n_parameters: int) -> float:
@@ -172,11 +177,18 @@ def final_scale(squared: np.ndarray, kept: np.ndarray, n_parameters: int) -> flo
     return float(max(np.sqrt(total / (free + 2.0 * _PRIOR_PAIRS)), _LEAST))
 
 
-def _descend(fit: Fit, problem: tuple, weigh, scale: float, n_steps: int = 60) -> Fit:
+def _descend(
+    fit: Fit,
+    problem: tuple,
+    weigh: Callable[[np.ndarray], np.ndarray],
+    scale: float,
+    n_steps: int,
+    near: float,
+) -> Fit:
     """Levenberg and Marquardt with weights from squared distances; the noise's shape follows the camera."""
     damping, converged = 1e-4, False
     for _ in range(n_steps):
-        fit = _replace(fit, weight=weigh(fit.squared), scale=scale)
+        fit = replace(fit, weight=weigh(fit.squared), scale=scale)
         off, prior = fit.priors.terms(fit.camera, fit.names)
         white = fit.whiten @ np.nan_to_num(fit.slope)
         error = np.einsum("pij,pj->pi", fit.whiten, np.nan_to_num(fit.residual))
@@ -201,10 +213,10 @@ def _descend(fit: Fit, problem: tuple, weigh, scale: float, n_steps: int = 60) -
         if fit_new is None:
             break
         fit, damping = fit_new, max(damping * 0.1, 1e-12)
-        if step_size < 1e-6:
+        if step_size < near:
             converged = True
             break
-    return _replace(fit, weight=weigh(fit.squared), scale=scale, converged=converged)
+    return replace(fit, weight=weigh(fit.squared), scale=scale, converged=converged)
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -221,9 +233,3 @@ def _trial(fit: Fit, problem: tuple, step: np.ndarray) -> Fit | None:
         if name.startswith("log_") and abs(change) > 1.0:
             return None
     return at(moved(fit.camera, fit.names, step), *problem)
-
-
-def _replace(fit: Fit, **changes) -> Fit:
-    from dataclasses import replace
-
-    return replace(fit, **changes)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from acino_fte.data_tools.lidar_solve_fit import OUTLIER, Fit, robust_fit
-from acino_fte.data_tools.lidar_solve_model import PickNoise
+from acino_fte.data_tools.lidar_solve_fit import OUTLIER, Fit, polished
+from acino_fte.data_tools.lidar_solve_model import PickNoise, pick_covariance, projection
 
 LENSES = (("log_aspect",), ("k1",), ("k1", "k2"), ("log_aspect", "k1"), ("log_aspect", "k1", "k2"))
 """What may be added to focal length and principal point, the simplest first."""
@@ -46,7 +46,7 @@ def choose_lens(fit: Fit, pixel: np.ndarray, xyz: np.ndarray, noise: PickNoise) 
         names = fit.names + more
         if len(names) > len(pixel):  # fewer than two numbers a parameter
             continue
-        trial = robust_fit(fit.camera, names, pixel, xyz, noise, fit.priors)
+        trial = polished(fit.camera, names, pixel, xyz, noise, fit.priors, fit.scale)
         limit = OUTLIER * fit.scale**2
         better = np.minimum(left_out_squared(fit), limit) - np.minimum(left_out_squared(trial), limit)
         better /= fit.scale**2
@@ -54,3 +54,15 @@ def choose_lens(fit: Fit, pixel: np.ndarray, xyz: np.ndarray, noise: PickNoise) 
         if sure > 0 and better.sum() > gain + 2.0 * (len(names) - len(best.names)):
             best, gain = trial, better.sum()
     return best
+
+
+def expected_rmse(fit: Fit, xyz: np.ndarray, noise: PickNoise) -> tuple[float, float]:
+    """What errors to expect of new picks on points (K, 3): of the true camera, and of the one in the fit, px.
+
+    The second is from the covariance of the fit: at the true camera and with the true noise it is the
+    Cramér-Rao bound of what can be reached with these pairs, to first order.
+    """
+    _, slope, for_point = projection(fit.camera, xyz, fit.names)
+    floor = np.trace(pick_covariance(for_point, xyz, noise), axis1=1, axis2=2)
+    added = np.einsum("pij,jk,pik->p", slope, fit.covariance, slope)
+    return float(np.sqrt(floor.mean())), float(np.sqrt((floor + added).mean()))
