@@ -33,8 +33,9 @@ def depth_figure(result: FTEResult) -> Figure:
     keys(
         figure,
         [
-            ("nearest to farthest marker", PALE),
+            ("band: nearest to farthest marker", GREY),
             (f"measured ({numbers['n']}, of {numbers['n_returns']} returns)", BLUE),
+            ("dashed: ± standard deviation", ORANGE),
             (f"RMSE {100 * numbers['rmse']:.1f} cm, median {100 * numbers['median']:.1f} cm", GREY),
         ],
         0.12,
@@ -63,7 +64,7 @@ def _spread(axes: Axes, depth: DepthResiduals) -> None:
     axes.axvline(0.0, color=GREY, lw=0.8)
     for side in (-1, 1):
         axes.axvline(side * 100 * float(np.median(depth.sd)), color=ORANGE, lw=0.8, ls="--")
-    axes.set_xlabel("Predicted − measured (cm); dashed: ± standard deviation")
+    axes.set_xlabel("Predicted − measured (cm)")
     axes.set_ylabel("Measurements")
     if not inside.all():
         axes.set_title(f"{int((~inside).sum())} beyond ±{width:.0f} cm", loc="right", fontsize=8)
