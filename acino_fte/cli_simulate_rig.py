@@ -95,6 +95,13 @@ def simulate_rig(
     ] = 0.0,
     occlusion: Annotated[bool, _say("Markers hidden by the body are guessed.", _FAULT)] = False,
     quantise: Annotated[bool, _say("Round to DeepLabCut's grid.", _FAULT, "--quantise")] = False,
+    proportions: Annotated[
+        float,
+        _say("Standard deviation of the logarithm of each segment group's length.", _MOVE, min=0.0, max=1.0),
+    ] = 0.0,
+    offsets_mm: Annotated[
+        float, _say("Markers are found beside their place: standard deviation.", _MOVE, min=0.0, max=1e3)
+    ] = 0.0,
     lidar: Annotated[
         _Lidar, _say("A scan; one return at every visible marker and frame; or no lidar.", _LIDAR)
     ] = _Lidar.scan,

@@ -102,6 +102,7 @@ def _write_sequence(simulation: RigSimulation, folder: Path, name: str) -> None:
     from acino_fte.data_tools.calibration import write_cameras
     from acino_fte.data_tools.deeplabcut import write_deeplabcut_csv
     from acino_fte.data_tools.sequence_file import write_sequence_file
+    from acino_fte.data_tools.truth_parameters import FILE_NAME, write_truth_parameters
 
     detections = simulation.detections
     write_cameras(folder / "cameras.json", CameraArray((simulation.camera,)))
@@ -124,6 +125,10 @@ def _write_sequence(simulation: RigSimulation, folder: Path, name: str) -> None:
     }
     if simulation.lidar is not None:
         content["lidar"] = _write_lidar(simulation, simulation.lidar, folder)
+    options = simulation.options
+    if options.proportions or options.offsets_mm or options.swaps:
+        write_truth_parameters(folder / FILE_NAME, simulation.truth_parameters)
+        content["truth_parameters"] = FILE_NAME
     write_sequence_file(folder / "sequence.yaml", content)
 
 

@@ -52,6 +52,8 @@ class RigOptions:
         Standard deviation of each component of a shake of 1–8 Hz, mrad.
     noise_px, missing, outliers, swaps, occlusion, occlusion_px, quantise
         Of the detector, as :class:`acino_fte.simulation_options.SimulationOptions` has them.
+    proportions, offsets_mm : float
+        Of the animal and its markers, as :class:`acino_fte.simulation_options.SimulationOptions` has them.
     lidar : str
         ``"scan"``: the returns of a scanning lidar. ``"pseudo"``: one return a frame at the pixel of every
         marker that is in the picture and not hidden. ``"none"``: no lidar.
@@ -122,6 +124,8 @@ class RigOptions:
     occlusion: bool = False
     occlusion_px: float = 15.0
     quantise: bool = False
+    proportions: float = 0.0
+    offsets_mm: float = 0.0
     lidar: Literal["scan", "pseudo", "none"] = "scan"
     body: Literal["links", "capsules"] = "links"
     surface_m: float = 0.04
@@ -206,6 +210,8 @@ _RANGES: tuple[tuple[str, float, float, str], ...] = (
     ("outliers", 0.0, 1.0, "a fraction from 0 to 1"),
     ("swaps", 0.0, 1.0, "a fraction from 0 to 1"),
     ("occlusion_px", 0.0, 1e4, "px, at least 0"),
+    ("proportions", 0.0, 1.0, "of a logarithm of lengths, from 0 to 1"),
+    ("offsets_mm", 0.0, 1e3, "mm, from 0 to 1000"),
     ("surface_m", 1e-4, 1.0, "m, above 0"),
     ("background", 0.0, 1.0, "a fraction from 0 to 1"),
     ("range_noise_m", 0.0, 1.0, "m, from 0 to 1"),

@@ -18,7 +18,7 @@ from acino_fte.cameras import Camera, CameraArray
 from acino_fte.data_tools.recording import ImuSamples
 from acino_fte.data_tools.rotations import rotation_matrix
 from acino_fte.detector import Detections, Faults, detect
-from acino_fte.kinematics import load_kinematics
+from acino_fte.imperfections import Imperfections, draw_imperfections
 from acino_fte.lidar import Lidar
 from acino_fte.motions import Motion, plan_motion
 from acino_fte.occlusion import hidden_by_body
@@ -37,6 +37,7 @@ from acino_fte.rig_lidar import (
 from acino_fte.rig_motion import CameraPath, plan_camera
 from acino_fte.rig_options import RigOptions
 from acino_fte.simulate import is_bundled
+from acino_fte.simulation_options import SimulationOptions
 from acino_fte.skeleton import Skeleton, load_skeleton
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ class RigSimulation:
     q : (N, Q)
         True degrees of freedom at the frames, rad and m.
     positions : (N, M, 3)
-        True marker positions at the frames, m, world.
+        True positions at the frames of the points that the detector looks for, m, world.
     camera : Camera
         As it is given to the user, with a pose a frame unless it is fixed.
     true_camera : Camera
@@ -83,7 +84,10 @@ class RigSimulation:
     scenery : Scenery
         The bushes.
     motion : Motion
-        The animal at any time.
+        The animal at any time, with its proportions.
+    parameters : dict
+        True ``segment_scale``, ``marker_offset_m`` and, of the camera, zeros, as
+        :attr:`acino_fte.simulate.Simulation.parameters` has them.
     """
 
     skeleton: Skeleton
@@ -103,6 +107,17 @@ class RigSimulation:
     path: CameraPath
     scenery: Scenery
     motion: Motion
+    parameters: dict[str, Any]
+
+    @property
+    def truth_parameters(self) -> dict[str, Any]:
+        """``parameters`` and, as ``swapped``, the left/right swaps: all plain values."""
+        marker, swapped = self.skeleton.marker_names, self.detections.swapped
+        places = [
+            [int(n), CAMERA, [marker[m] for m in np.flatnonzero(swapped[n, 0])]]
+            for n in np.flatnonzero(swapped.any(axis=(1, 2)))
+        ]
+        return {**self.parameters, "swapped": places}
 
     @property
     def notes(self) -> list[str]:
@@ -138,17 +153,21 @@ def simulate_rig(options: RigOptions | None = None, skeleton: Skeleton | None = 
     """
     options = options or RigOptions()
     skeleton = skeleton or load_skeleton(options.species)
+    flaws = _draw_flaws(skeleton, options)
+    kinematics, parameters = flaws.body(skeleton)
     motion = plan_motion(
-        load_kinematics(skeleton),
+        kinematics,
         options.motion,
         options.n_frames,
         options.fps,
         seed=options.seed,
         longest_path=options.path_limit,
+        parameters=parameters,
     )
+    kinematics, parameters = flaws.animal(skeleton)
     path = plan_camera(options, motion)
     camera = true_camera(options, path)
-    positions = motion.kinematics.positions(motion.at_frames)
+    positions = kinematics.positions(motion.at_frames, parameters)
     pixels = camera.project(positions)
     stamps = stamp_frames(options)
     hidden = hidden_by_body(skeleton, positions, CameraArray((camera,)))
@@ -179,7 +198,16 @@ def simulate_rig(options: RigOptions | None = None, skeleton: Skeleton | None = 
         path,
         scenery,
         motion,
+        flaws.parameters(skeleton, [CAMERA]),
     )
+
+
+def _draw_flaws(skeleton: Skeleton, options: RigOptions) -> Imperfections:
+    """Proportions of the animal and places of its markers."""
+    asked = SimulationOptions(
+        n_cameras=1, proportions=options.proportions, offsets_mm=options.offsets_mm, seed=options.seed
+    )
+    return draw_imperfections(skeleton, asked)
 
 
 def true_camera(options: RigOptions, path: CameraPath) -> Camera:
@@ -283,22 +311,6 @@ def rig_to_sequence(simulation: RigSimulation, name: str | None = None) -> Seque
         detections=detections,
         cameras=CameraArray((simulation.camera,)),
         truth=truth,
-        truth_parameters=truth_parameters(simulation),
+        truth_parameters=simulation.truth_parameters,
         lidar=simulation.lidar,
     )
-
-
-def truth_parameters(simulation: RigSimulation) -> dict[str, Any]:
-    """What else is known of the recording, as :attr:`acino_fte.simulate.Simulation.truth_parameters`."""
-    marker, swapped = simulation.skeleton.marker_names, simulation.detections.swapped
-    places = [
-        [int(n), CAMERA, [marker[m] for m in np.flatnonzero(swapped[n, 0])]]
-        for n in np.flatnonzero(swapped.any(axis=(1, 2)))
-    ]
-    return {
-        "time_offset_s": {CAMERA: 0.0},
-        "extrinsics": {CAMERA: {"rotation_rad": [0.0] * 3, "translation_m": [0.0] * 3}},
-        "segment_scale": dict.fromkeys(simulation.skeleton.groups, 1.0),
-        "marker_offset_m": {name: [0.0] * 3 for name in marker},
-        "swapped": places,
-    }

@@ -43,7 +43,8 @@ def link_distances(simulation: RigSimulation, chosen: np.ndarray) -> np.ndarray:
     """Distances (K, E) of chosen returns to all drawn lines, as they are at the time of each, m."""
     points = world_returns(simulation)[chosen, None]
     time = simulation.returns.time[chosen]
-    positions = simulation.motion.kinematics.positions(simulation.motion(time))
+    motion = simulation.motion
+    positions = motion.kinematics.positions(motion(time), motion.parameters)
     a, b = np.array(simulation.skeleton.edges).T
     return np.sqrt(segment_distance_squared(points, points, positions[:, a], positions[:, b]))
 
@@ -330,6 +331,20 @@ def test_the_sequence_has_detections_cameras_lidar_and_truth(usual):
     cut = sequence.select_frames(10, 20)
     assert len(cut.cameras[0].rotation) == 10
     assert rig_to_sequence(simulate_rig(RigOptions(lidar="none", n_frames=2))).lidar is None
+
+
+def test_an_individual_has_its_own_proportions_and_markers():
+    simulation = simulate_rig(replace(SMALL, proportions=0.1, offsets_mm=20.0, swaps=0.5, n_frames=8))
+    truth = rig_to_sequence(simulation).truth_parameters
+    assert len({round(v, 6) for v in truth["segment_scale"].values()}) > 5
+    assert truth["swapped"]
+    chosen = np.flatnonzero(simulation.returns.on_body)
+    own = link_distances(simulation, chosen)[np.arange(len(chosen)), simulation.returns.link[chosen]]
+    assert own == pytest.approx(np.full(len(chosen), 0.04), abs=1e-6)  # the body is the animal's own
+    on_links = simulation.motion.kinematics.positions(simulation.q, simulation.motion.parameters)
+    offset = np.linalg.norm(simulation.positions - on_links, axis=2)
+    stated = [np.linalg.norm(truth["marker_offset_m"][m]) for m in simulation.skeleton.marker_names]
+    assert offset == pytest.approx(np.tile(stated, (8, 1)), abs=1e-9)
 
 
 def test_long_runs_are_told_of():

@@ -13,6 +13,7 @@ from acino_fte.data_tools.lidar_camera import read_lidar_camera
 from acino_fte.data_tools.load import load_sequence
 from acino_fte.data_tools.lvx import LvxReader
 from acino_fte.data_tools.recording import GRAVITY
+from acino_fte.data_tools.rotations import rotation_vector
 from acino_fte.errors import InputError
 from acino_fte.rig_files import write_rig_simulation
 from acino_fte.rig_options import RigOptions
@@ -166,6 +167,21 @@ def test_the_landscape_pans_by_the_homography_of_the_rotation(simulation):
     error = np.abs(moved - pictures[11])[chosen].mean()
     unmoved = np.abs(pictures[0].astype(float) - pictures[11])[chosen].mean()
     assert error < 0.25 * unmoved
+
+
+def test_odometry_finds_the_pan_in_the_pictures(simulation):
+    pytest.importorskip("cv2")
+    from acino_fte.data_tools.odometry import visual_odometry
+    from acino_fte.data_tools.odometry_features import keypoint_boxes
+
+    camera, frames = small_camera(simulation.true_camera, 384), np.array([0, 5, 11])
+    pictures = [p for n, p in enumerate(render_pictures(simulation, 384)) if n in frames]
+    boxes = keypoint_boxes(camera.project(simulation.positions)[frames])
+    found = visual_odometry(pictures, camera.at_frames(slice(0, 1)), model="rotation", boxes=boxes)
+    turn = found.rotation[-1] @ found.rotation[0].T
+    true = camera.rotation[11] @ camera.rotation[0].T
+    assert np.degrees(np.linalg.norm(rotation_vector(true))) > 1.0
+    assert np.degrees(np.linalg.norm(rotation_vector(turn @ true.T))) < 0.01
 
 
 def test_the_animal_is_drawn_where_the_detector_sees_it(simulation):
