@@ -54,16 +54,16 @@ def build_page(page: PageSession, session: AdjustSession, pictures: Pictures) ->
         if view["pictures"]:
             for frame in range(about["frames"][0], about["frames"][1] + 1):
                 page.share(f"p{c}-{frame}.jpg", partial(pictures.jpeg, view["name"], frame), "image/jpeg")
-    about["begin"] = about["frames"][0]
     ui.on("adjust", lambda event: _answer(session, event.args))
-    ui.run_javascript(f"{SCRIPT}\nadjust.start({json.dumps(about)});")
+    first = session.frame(about["frames"][0])
+    ui.run_javascript(f"{SCRIPT}\nadjust.start({json.dumps(about)}, {json.dumps(first)});")
 
 
 def _bar(page: PageSession, session: AdjustSession) -> None:
     from nicegui import ui
 
     with ui.element("div").props('id="adjust-bar"'):
-        ui.label(session.run.name).props('id="adjust-run"').tooltip(str(session.path))
+        ui.label(session.run.name).classes("adjust-run").tooltip(str(session.path))
         for icon, text, call in _STEPS[:2]:
             _button(icon, text, call)
         ui.html(FRAME, sanitize=False)

@@ -18,7 +18,7 @@ const images = new Map();
 
 function tell(what) { emitEvent('adjust', what); }
 
-function start(given) {
+function start(given, first) {
   about = given;
   const grid = by('adjust-views'), n = about.views.length;
   const columns = n === 1 ? 1 : n <= 4 ? 2 : 3;
@@ -38,7 +38,7 @@ function start(given) {
   new ResizeObserver(fitAll).observe(grid);
   new ResizeObserver(() => space.draw()).observe(by('adjust-space'));
   space.listen();
-  choose(0, about.begin);
+  receive(first);
 }
 
 function stacked() {  // two views: side by side, or one above the other, whichever shows them larger
@@ -118,7 +118,9 @@ function go(frame) {
 function ask() {
   if (performance.now() - asked < 1500) return;  // one question at a time; an answer lost is asked again
   asked = performance.now();
+  const mine = asked;
   tell({ do: 'frame', frame: wanted });
+  setTimeout(() => { if (asked === mine) ask(); }, 1600);
 }
 function receive(answer, chosen) {
   const first = data === null;
@@ -376,7 +378,6 @@ function select(m) {
   const row = document.querySelectorAll('#adjust-list tbody tr')[marker];
   row.scrollIntoView({ block: 'nearest' });
 }
-function choose(m, frame) { marker = m; go(frame); }
 function refreshBar() {
   by('adjust-slider').value = wanted;
   if (document.activeElement !== by('adjust-frame')) by('adjust-frame').value = wanted;

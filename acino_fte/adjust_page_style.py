@@ -9,7 +9,7 @@ body { background: #15181d; color: #e6e8eb; font: 13px/1.4 system-ui, "Segoe UI"
 #adjust-bar { grid-column: 1 / 3; display: flex; align-items: center; gap: 6px; padding: 0 10px;
   background: #1f242c; border-bottom: 1px solid #2e3540; }
 #adjust-bar .q-btn { color: #d5dae1; }
-#adjust-run { font-weight: 600; max-width: 190px; overflow: hidden; text-overflow: ellipsis;
+.adjust-run { font-weight: 600; max-width: 190px; overflow: hidden; text-overflow: ellipsis;
   white-space: nowrap; }
 #adjust-slider { flex: 1; min-width: 80px; accent-color: #56b4e9; }
 #adjust-frame { width: 58px; background: #12151a; color: inherit; border: 1px solid #3a424e;

@@ -92,7 +92,7 @@ class AdjustSession:
             "views": [{"name": c.name, "size": list(c.resolution)} for c in run.cameras],
             "frames": [int(run.frames[0]), int(run.frames[-1])],
             "fps": run.fps,
-            "large": self.large_px,
+            "large": LARGE_PX,
             "cameras": [_listed(still(c, 0).centre) for c in run.cameras],
         }
 

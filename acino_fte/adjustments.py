@@ -98,6 +98,7 @@ class Adjustments:
             One step to undo with the change just before, when that is of the same marker and a moment ago.
         """
         now = datetime.now(UTC)
+        frame = int(frame)
         entry = Adjustment(
             frame=frame,
             marker=marker,
@@ -135,6 +136,7 @@ class Adjustments:
 
     def check(self, frame: int) -> bool:
         """Mark a frame as checked, or take the mark away; whether it has one now."""
+        frame = int(frame)
         now = frame not in self.checked
         self._do(frame, not now, now)
         return now

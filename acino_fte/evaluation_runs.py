@@ -235,7 +235,7 @@ def _check_folder(folder: Path) -> None:
     if not missing:
         return
     entries = sorted(p.name for p in folder.iterdir())
-    unfinished = ".tmp-" in folder.name or len(missing) < 3
+    unfinished = ".tmp-" in folder.name or not {DATA, METRICS} <= set(missing)
     raise InputError(
         "The folder holds an unfinished run." if unfinished else "The folder holds no run.",
         file=folder,
