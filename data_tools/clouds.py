@@ -228,3 +228,15 @@ def _packed(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         red, green, blue = (columns[name].astype("<u4") for name in _COLOURS[0])
         out["rgba"] = np.uint32(0xFF000000) | red << 16 | green << 8 | blue
     return out
+
+
+def read_returns(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (K, 3), m, and intensities (K,) of a point cloud; zeros where it has none.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_cloud` does.
+    """
+    cloud = read_cloud(path)
+    return cloud.xyz, np.zeros(len(cloud)) if cloud.intensity is None else cloud.intensity

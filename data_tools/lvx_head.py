@@ -15,6 +15,7 @@ from acino_fte.errors import InputError
 
 _HEAD_BYTES = 40_000  # more than a head of 255 devices and one frame's first packages
 _SEARCH_BYTES = 64 << 20
+_TRIED_FRAMES = 4
 _NAME = b"livox_tech"
 
 
@@ -139,13 +140,13 @@ def _devices(data: bytes, layout: Layout, count: int) -> tuple[tuple[LvxDevice, 
 
 def _found(file: BinaryIO, path: Path, named: Layout | None, signed: bool, data: bytes) -> LvxHead:
     """The head of a file whose head is unusable: its version is that of the first frame found."""
-    places: dict[Version, int] = {}
+    skipped: dict[Version, tuple[int, int]] = {}
     for version, layout in LAYOUTS.items():
         place = Walk(file, PackageTest(layout), 0).find_frame(_SEARCH_BYTES)
         if place is not None:
-            places[version] = place
-    if places:
-        best = min(places, key=lambda version: (places[version], LAYOUTS[version] is not named))
+            skipped[version] = _skipped(file, layout, place), place
+    if skipped:
+        best = min(skipped, key=lambda version: (*skipped[version], LAYOUTS[version] is not named))
         layout = LAYOUTS[best]
         start = Walk(file, PackageTest(layout), 0).find_any()  # packages of a frame without its header
         note = f"The head is unusable; what follows from byte {start} on is LVX {best}."
@@ -161,6 +162,15 @@ def _found(file: BinaryIO, path: Path, named: Layout | None, signed: bool, data:
         found=repr(data[:16])[1:] if data else "an empty file",
         remedy="check the path; bags and videos are read by their own readers",
     )
+
+
+def _skipped(file: BinaryIO, layout: Layout, place: int) -> int:
+    """Bytes of the next frames that make no packages by this layout."""
+    walk = Walk(file, PackageTest(layout), place)
+    for number, _ in enumerate(walk.frames()):
+        if number >= _TRIED_FRAMES:
+            break
+    return sum(hole.stop - hole.start for hole in walk.holes)
 
 
 def open_binary(path: Path) -> io.BufferedReader:

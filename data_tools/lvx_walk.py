@@ -210,7 +210,7 @@ class Walk:
             at = pos - self._base
             if at >= len(self._data):
                 return None
-            if self._header(at):
+            if self._header(at) and self._chain(at + self._skip, 2, None):
                 return pos
             pos += 1
         return None
@@ -246,16 +246,17 @@ class Walk:
         three = self._three(at)
         if three is None:
             return False
-        if not self._mark(*three):
+        if not self._mark(three, self._index):
             return False
-        return self._chain(at + self._skip, 3 if self._index is None else 2)
+        return self._chain(at + self._skip, 3 if self._index is None else 2, three[2])
 
-    def _mark(self, current: int, following: int, index: int) -> bool:
-        """Whether three numbers may be those of a header: its number is the next, or its length is one."""
+    def _mark(self, three: tuple[int, int, int], before: int | None) -> bool:
+        """Whether numbers may be those of a header: its index is the next, or its length is one."""
+        current, following, index = three
         long = self._skip <= following - current <= _LONGEST_FRAME
-        if self._index is None:
+        if before is None:
             return long and index < 10_000_000
-        step = index - self._index
+        step = index - before
         return step == 1 or (long and 0 < step <= 10_000)
 
     def _header(self, at: int) -> bool:
@@ -276,8 +277,8 @@ class Walk:
 
     # ------------------------------------------------------------------------------ damage
 
-    def _chain(self, at: int, links: int, crumbs: bool = True) -> bool:
-        """Whether so many packages follow one another from here on, or the file ends first.
+    def _chain(self, at: int, links: int, index: int | None, crumbs: bool = True) -> bool:
+        """Whether so many packages follow one another from here on in frame `index`, or the file ends first.
 
         Without `crumbs` it may not end with a few bytes that could be anything.
         """
@@ -288,7 +289,8 @@ class Walk:
             size = self._test.size(data, at)
             if not size:
                 three = self._three(at)
-                return self._strong(at) or (three is not None and self._mark(*three))
+                known = three is not None and index is not None
+                return self._strong(at) or (three is not None and known and self._mark(three, index))
             at += size
         return True
 
@@ -303,7 +305,7 @@ class Walk:
         before = self._last.get((self._test.device(data, at), self._test.kind(data, at)))
         if before is not None and self._test.follows(before, data, at):
             return True
-        return self._chain(at + size, 2, crumbs=False)
+        return self._chain(at + size, 2, self._index, crumbs=False)
 
     def _resync(self, pos: int) -> int:
         """The next place from `pos` on where the walk can go on; the end of the file if there is none."""
