@@ -73,7 +73,18 @@ def calibrate_lidar(
         if resolution is None and images:
             from acino_fte.calibrate_page import serve
 
-            code = serve(list(images), list(cloud or ()), out, pairs, lens, port=port, open_browser=browser)
+            code = serve(
+                images,
+                cloud or (),
+                out,
+                pairs,
+                lens,
+                fit=_fit(fit),
+                focal_px=_focal(focal),
+                report=report,
+                port=port,
+                open_browser=browser,
+            )
             if code:
                 raise typer.Exit(code)
             return
