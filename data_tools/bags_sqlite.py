@@ -56,7 +56,7 @@ class SqliteWalk:
 
     def overview(self) -> bool:
         """Topics and counts as SQLite reads them; whether it does."""
-        if self._logged():
+        if self._logged() or self.path.stat().st_size < self._size_said():
             return False
         try:
             with closing(self._connect()) as connection:
@@ -86,17 +86,19 @@ class SqliteWalk:
 
     def messages(self, payloads: bool = True) -> Messages:
         """All whole messages; without `payloads` their data are left empty."""
-        if not self._logged():
+        self._last = 0
+        if not self._logged() and self.path.stat().st_size >= self._size_said():
             try:
                 with closing(self._connect()) as connection:
                     self._topics(connection)
                     what = "data" if payloads else "x''"
                     select = f"SELECT id, topic_id, timestamp, {what} FROM messages ORDER BY id"  # noqa: S608
                     for number, topic, stamp, data in connection.execute(select):
+                        if not isinstance(number, int) or number <= self._last:
+                            raise ValueError("its rows are out of order")
                         yield from self._message(topic, stamp, data)
                         self._last = number
-                if self.path.stat().st_size >= self._size_said():
-                    return
+                return
             except _BROKEN as error:
                 self.losses.note(
                     f"SQLite stops after row {self._last} ({error}); its pages are read one by one"
