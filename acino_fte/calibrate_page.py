@@ -16,6 +16,8 @@ from acino_fte.calibrate_page_work import Save, Solve, Work
 from acino_fte.local_page import Ending, PageSession, serve_page
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from acino_fte.cameras import Camera
     from acino_fte.data_tools.lidar_pairs import LidarPairs
     from acino_fte.data_tools.lidar_solve import Calibration
@@ -74,9 +76,10 @@ def serve(
         return solve_lidar_camera(picked, resolution, camera, fit, focal_px=focal_px)
 
     pictures = {path.name: path for path in images} if report else None
+    shown = {one.name: one.xyz for one in placements}
     path = pairs or out.with_name(out.stem + "_pairs.csv")
     calibrate_by_hand(
-        placements, path, solve, partial(_save, out, pictures), port=port, open_browser=open_browser
+        placements, path, solve, partial(_save, out, pictures, shown), port=port, open_browser=open_browser
     )
     return 0
 
@@ -137,15 +140,18 @@ def _overlay(work: Work, name: str) -> bytes:
     return work.overlay(name)[0]
 
 
-def _save(out: Path, pictures: dict[str, Path] | None, calibration: Calibration) -> tuple[Path, ...]:
+def _save(
+    out: Path, pictures: dict[str, Path] | None, clouds: dict[str, np.ndarray], calibration: Calibration
+) -> tuple[Path, ...]:
     """Write the calibration, and its report where there are pictures for it."""
     from acino_fte.data_tools.lidar_camera import write_lidar_camera
-    from acino_fte.data_tools.lidar_report import write_calibration_report
 
     out.parent.mkdir(parents=True, exist_ok=True)
     write_lidar_camera(out, calibration.lidar_camera)
     if pictures is None:
         return (out,)
+    from acino_fte.data_tools.lidar_report import write_calibration_report
+
     folder = out.with_name(out.stem + "_report")
-    write_calibration_report(folder, {out.stem: calibration}, pictures)
+    write_calibration_report(folder, {out.stem: calibration}, pictures, clouds)
     return out, folder

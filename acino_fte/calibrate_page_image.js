@@ -101,6 +101,10 @@ export default {
       const box = this.$refs.canvas.getBoundingClientRect(), [x, y] = this.to_view(u, v);
       return [box.left + x, box.top + y];
     },
+    pixel_at(x, y) { // the other way
+      const box = this.$refs.canvas.getBoundingClientRect();
+      return this.to_pixel(x - box.left, y - box.top);
+    },
     inside(u, v) {
       return u >= -0.5 && v >= -0.5 && u < this.picture.naturalWidth - 0.5 && v < this.picture.naturalHeight - 0.5;
     },

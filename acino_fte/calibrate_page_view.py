@@ -15,6 +15,8 @@ from acino_fte.calibrate_page_work import Work
 from acino_fte.errors import InputError
 from acino_fte.local_page import PageSession, show_error
 
+_PAUSE = 0.5  # s without a change before the pairs are solved
+
 
 class Tab:
     """The page in one tab of the browser. All tabs share the work, and follow its changes.
@@ -36,7 +38,6 @@ class Tab:
         self.client = ui.context.client
         self.cloud: CloudView
         self._shown_image = ""
-        self._busy = False
         ui.dark_mode(True)
         ui.add_css(STYLE)
         self._head()
@@ -51,7 +52,7 @@ class Tab:
         self.show_image(self.image)
         if work.n_found:
             ui.notify(f"{work.n_found} pairs found in {work.path}; go on.", type="info", position="bottom")
-        ui.timer(0.05, self.solve_if_due, once=True)
+        ui.timer(0.1, self.solve_if_due)
 
     # -- elements --------------------------------------------------------------------------------------
     def _head(self) -> None:
@@ -154,7 +155,6 @@ class Tab:
             show_error(error)
             outcome = None
         self.refresh_all()
-        ui.timer(0.05, self.solve_if_due, once=True)
         return outcome
 
     def pick(self, **side: Any) -> None:
@@ -174,9 +174,10 @@ class Tab:
     def choose(self, number: int) -> None:
         """Highlight a pair, and bring it into both views."""
         pair = self.work.book.pair(number)
-        self.chosen = None if self.chosen == number else number
+        chosen = None if self.chosen == number else number
         if pair.image != self.image:
             self.show_image(pair.image)
+        self.chosen = chosen
         self.refresh()
         if self.chosen and pair.pixel and pair.xyz:
             self.view.show_pixel(*pair.pixel)
@@ -232,30 +233,33 @@ class Tab:
 
     # -- solving, saving -------------------------------------------------------------------------------
     async def solve_if_due(self) -> None:
-        """Solve in the background where the pairs have changed."""
-        while self.work.due and not self._busy:
+        """Solve in the background where the pairs have changed, once they rest for a moment."""
+        if self.work.due and self.work.quiet > _PAUSE:
             await self.solve()
 
     async def solve(self) -> None:
         """Solve now."""
-        if self._busy:
+        if self.work.solving:
             return
-        self._busy = True
+        self.work.solving = True
         self.solve_button.props("loading")
         try:
             await run.io_bound(self.work.solve)
         finally:
-            self._busy = False
+            self.work.solving = False
             self.solve_button.props(remove="loading")
         self.refresh_all()
 
     async def save(self) -> bool:
         """Write the calibration and its report; False where there is none."""
+        self.save_button.props("loading")
         try:
             written = await run.io_bound(self.work.save)
         except InputError as error:
             show_error(error)
             return False
+        finally:
+            self.save_button.props(remove="loading")
         ui.notify(
             saved_text(written, self.work), type="positive", multi_line=True, position="top", timeout=8000
         )

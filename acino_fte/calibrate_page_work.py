@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,6 +57,9 @@ class Work:
         self.version = 0
         """Grows with every solution: addresses of overlays carry it."""
         self.saved = False
+        self.solving = False
+        """Whether a solution is under way."""
+        self._changed_at = 0.0
         self._solve, self._save = solve, save
         self._solved: tuple[Pair, ...] | None = None
         self._failed: tuple[Pair, ...] | None = None
@@ -63,6 +67,12 @@ class Work:
     def _changed(self, picks: Picks) -> None:
         save_picks(self.path, picks)
         self.saved = False
+        self._changed_at = time.monotonic()
+
+    @property
+    def quiet(self) -> float:
+        """Seconds since the last change."""
+        return time.monotonic() - self._changed_at
 
     # -- solving ---------------------------------------------------------------------------------------
     @property
