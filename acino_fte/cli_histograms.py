@@ -77,7 +77,7 @@ def histograms(
 
     with reported_errors(), spinner(quiet) as show:
         for run in runs:
-            check_output_folder(out, input_folder=run if run.exists() else None, contents=EVALUATION)
+            check_output_folder(out, input_folder=run if run.is_dir() else None, contents=EVALUATION)
         folder = check_output_folder(out, contents=EVALUATION)
         threshold = _threshold(threshold_px, threshold_sd)
         show("reading")

@@ -24,7 +24,7 @@ from acino_fte.result_files import Contents, written_whole
 _TABLES = ("reprojection", "adjustments", "depth")
 _ENDINGS = (".csv", ".md", ".tex", "_parts.tex", "_markers.tex")
 EVALUATION = Contents(
-    "evaluation",
+    "comparison of runs",
     ("evaluation.json", "figures", *(name + ending for name in _TABLES for ending in _ENDINGS)),
     ("evaluation.json", "reprojection.csv"),
 )
