@@ -93,9 +93,8 @@ def main() -> None:
     parser.add_argument("--cut", action="store_true", help="cut the last hundredth off each file")
     parser.add_argument("--only", choices=list(FORMS))
     args = parser.parse_args()
-    print(
-        f"{'format':12s} {'MB':>6s} {'messages':>9s} {'peak MiB':>9s} {'/300':>6s} {'MB/s':>7s} {'rosbags':>16s}"
-    )
+    heads = ("MB", "messages", "peak MiB", "/ 300", "MB/s")
+    print(f"{'format':12s}" + "".join(f"{head:>10s}" for head in heads) + f"{'rosbags':>20s}")
     for name, options in FORMS.items():
         if args.only not in (None, name):
             continue
@@ -112,13 +111,11 @@ def main() -> None:
                         opened.truncate(int(file.stat().st_size * 0.99))
             ours = measure(path, "acino")
             theirs = None if args.cut else measure(path, "rosbags")
-            beside = f"{theirs['peak']:6.0f} MiB {size / theirs['s']:4.0f}" if theirs else "refuses"
-            print(
-                f"{name:12s} {size:6.0f} {ours['n']:9d} {ours['peak']:9.0f} {ours['peak'] / BOUND:6.2f} "
-                f"{size / ours['s']:7.0f} {beside:>16s}   (import {ours['base']:.0f} MiB, whole {ours['whole']}, "
-                f"written in {wrote:.0f} s)",
-                flush=True,
-            )
+            beside = f"{theirs['peak']:.0f} MiB, {size / theirs['s']:.0f} MB/s" if theirs else "refuses"
+            numbers = (size, ours["n"], ours["peak"], ours["peak"] / BOUND, size / ours["s"])
+            row = "".join(f"{x:10.2f}" if x < 10 else f"{x:10.0f}" for x in numbers)
+            notes = f"import {ours['base']:.0f} MiB, whole {ours['whole']}, written in {wrote:.0f} s"
+            print(f"{name:12s}{row}{beside:>20s}   ({notes})", flush=True)
 
 
 if __name__ == "__main__":

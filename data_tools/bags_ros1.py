@@ -105,10 +105,26 @@ class Ros1Walk:
                         self.counts[conn] = self.counts.get(conn, 0) + n
         return set(self.counts) <= set(self.connections)
 
+    def _connections_at_end(self) -> None:
+        """Connections of an index that is not where the head says."""
+        with self.path.open("rb") as file:
+            file.seek(max(self._file_end - _SCAN, len(MAGIC)))
+            data = memoryview(file.read())
+        for match in _OP.finditer(data):
+            for at in range(match.start() - 4, max(match.start() - _BACK, -1), -1):
+                found = (
+                    parse_head(data[at : at + 2 * _BACK]) if data[match.end() - 1] == _CONNECTION else None
+                )
+                if found and found[0] == _CONNECTION and at + found[2] + found[3] <= len(data):
+                    self._connection(found[1], bytes(data[at + found[2] : at + found[2] + found[3]]))
+                    break
+
     def messages(self, payloads: bool = True) -> Messages:
         """All whole messages; without `payloads` their data are left empty."""
         self._payloads = payloads
         indexed = self.overview()  # the chunk that has the connections may be damaged
+        if not indexed:
+            self._connections_at_end()
         self._index_counts = self._info_counts = 0
         with self.path.open("rb") as file:
             window = FileWindow(file, self._file_end)
