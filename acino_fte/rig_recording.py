@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from acino_fte.data_tools.recording import ImuSamples, LidarReturns, Picture, PictureInfo
+from acino_fte.errors import InputError
 from acino_fte.rig_clocks import lidar_clock, received
 from acino_fte.rig_lidar import BEAMS, firing_period
 from acino_fte.rig_pictures import render_pictures
@@ -73,21 +74,21 @@ def raw_imu(simulation: RigSimulation) -> ImuSamples:
 
 
 def raw_returns(simulation: RigSimulation) -> LidarReturns | None:
-    """The returns in the clock of the lidar, with the beams they are from as lines."""
-    returns = simulation.returns
+    """The returns in the clock of the lidar, with the beams they are from as lines.
+
+    Pseudo returns of one frame follow each other at the lidar's pace, as it can measure one at a time only.
+    """
+    returns, options = simulation.returns, simulation.options
     if returns is None:
         return None
-    beam = np.zeros(len(returns.time), dtype=np.int64)
-    if simulation.options.lidar == "scan":
-        beam += np.round(returns.time / firing_period(simulation.options)).astype(np.int64) % BEAMS
-    return LidarReturns(
-        lidar_clock(simulation.options, returns.time),
-        returns.xyz,
-        returns.intensity,
-        np.zeros(len(beam), dtype=np.uint8),
-        beam.astype(np.uint8),
-        clock="power_on",
-    )
+    time_ns = lidar_clock(options, returns.time)
+    count = np.round(returns.time / firing_period(options)).astype(np.int64)
+    if options.lidar == "pseudo" and len(count):
+        count += np.arange(len(count)) - np.searchsorted(returns.time, returns.time)
+        time_ns = time_ns[0] + (count - count[0]) * round(1e9 / options.points_per_second)
+    line = (count % BEAMS).astype(np.uint8)
+    none = np.zeros(len(line), dtype=np.uint8)
+    return LidarReturns(time_ns, returns.xyz, returns.intensity, none, line, clock="power_on")
 
 
 def _recorded(simulation: RigSimulation, width: int) -> Iterator[tuple[int, np.ndarray]]:
@@ -110,9 +111,17 @@ def _part_of(returns: LidarReturns, part: slice) -> LidarReturns:
 
 def _write_lvx(simulation: RigSimulation, path: Path) -> None:
     """Frames of 50 ms with the returns and the inertial samples of that time."""
-    from acino_fte.data_tools.lvx_packets import LvxDevice
+    from acino_fte.data_tools.lvx_packets import SAMPLE_NS, LvxDevice
     from acino_fte.data_tools.lvx_write import LvxWriter
 
+    if round(1e9 / simulation.options.points_per_second) != SAMPLE_NS[_TELE_15]:
+        raise InputError(
+            "A Tele-15 measures at one pace only, and its files do not say at which.",
+            key="points_per_second",
+            expected="240000 for an LVX file",
+            found=f"{simulation.options.points_per_second:g}",
+            remedy="record a bag instead",
+        )
     imu, returns = raw_imu(simulation), raw_returns(simulation)
     step = int(1e9 * _LVX_FRAME)
     first = int(imu.time_ns[0])

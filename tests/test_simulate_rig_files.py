@@ -117,6 +117,23 @@ def test_the_video_has_the_recorded_frames_with_their_stamps(folder, simulation)
     assert np.abs(pictures[0].pixels.astype(float) - made).mean() < 12  # what compression leaves
 
 
+@pytest.mark.parametrize("kind", ["pseudo", "none"])
+def test_lvx_of_pseudo_returns_and_of_none(kind, tmp_path):
+    simulation = simulate_rig(RigOptions(n_frames=3, rest_s=0.1, lidar=kind))
+    out = write_rig_simulation(simulation, tmp_path / "x", recording="lvx")
+    with LvxReader(out / "recording" / "rig.lvx") as reader:
+        values = [r.value for r in reader.records()]
+    lidar = [v for v in values if not hasattr(v, "rate")]
+    assert sum(map(len, values)) - sum(map(len, lidar)) == len(simulation.imu)
+    if kind == "none":
+        assert not lidar
+        assert load_sequence(out).lidar is None
+    else:
+        assert np.concatenate([v.xyz for v in lidar]) == pytest.approx(simulation.returns.xyz, abs=0.5001e-3)
+        late = np.concatenate([v.time_ns for v in lidar]) - raw_returns(simulation).time_ns
+        assert (late == 0).all()
+
+
 @pytest.mark.parametrize(("recording", "name"), [("bag1", "rig.bag"), ("bag2", "rig_ros2")])
 def test_bags_hold_what_the_rig_saw_in_the_order_of_reception(recording, name, simulation, tmp_path):
     bags = pytest.importorskip("acino_fte.data_tools.bags")
@@ -221,4 +238,7 @@ def test_wrong_input_is_told_and_nothing_is_written(run, simulation, tmp_path):
     (mine / "notes.txt").write_text("keep")
     with pytest.raises(InputError, match="left alone"):
         write_rig_simulation(simulation, mine, overwrite=True)
+    result = run(tmp_path / "x", "--points-per-second", 100_000, "--frames", 2, "--recording", "lvx")
+    assert result.exit_code == 2
+    assert "record a bag" in result.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine"]
