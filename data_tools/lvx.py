@@ -23,7 +23,8 @@ from acino_fte.data_tools.lvx_packets import (
     decode_points,
     decode_stamps,
 )
-from acino_fte.data_tools.lvx_walk import Hole, PackageTest, RawFrame, Walk
+from acino_fte.data_tools.lvx_recognise import PackageTest
+from acino_fte.data_tools.lvx_walk import Hole, RawFrame, Walk
 from acino_fte.data_tools.recording import (
     Clock,
     Damage,

@@ -10,7 +10,8 @@ from typing import BinaryIO
 import numpy as np
 
 from acino_fte.data_tools.lvx_packets import LAYOUTS, MAGIC, PUBLIC, SIGNATURE, Layout, LvxDevice, Version
-from acino_fte.data_tools.lvx_walk import PackageTest, Walk
+from acino_fte.data_tools.lvx_recognise import PackageTest
+from acino_fte.data_tools.lvx_walk import Walk
 from acino_fte.errors import InputError
 
 _HEAD_BYTES = 40_000  # more than a head of 255 devices and one frame's first packages

@@ -14,97 +14,14 @@ from typing import BinaryIO
 
 import numpy as np
 
-from acino_fte.data_tools.lvx_packets import FARTHEST_M, Layout, decode_imu, decode_points, decode_stamps
+from acino_fte.data_tools.lvx_recognise import PackageTest
 
 _BLOCK = 4 << 20
 _LOOK = 16_384  # more than three packages and three headers
 _BEHIND = 2_048  # the last package stays in reach
 _MOST = 4_096  # packages handed over at once, where no frame ends them
 _THREE = Struct("<QQQ")
-_LENGTH = Struct("<I")
 _LONGEST_FRAME = 1 << 28
-
-
-class PackageTest:
-    """Whether a package begins at a place, how long it is, and whose it is.
-
-    Parameters
-    ----------
-    layout : Layout
-    devices : mapping of int to int, optional
-        Index of the device by what packages call it; any device is taken without.
-    """
-
-    def __init__(self, layout: Layout, devices: dict[int, int] | None = None) -> None:
-        self.layout, self.devices = layout, devices
-        self.second = layout.version == "2"
-        self.header = layout.header.itemsize
-        self._sizes = {kind: layout.package(kind).itemsize for kind in layout.kinds}
-        self._steps = {kind: layout.kinds[kind].sample.itemsize for kind in layout.kinds}
-
-    def size(self, data: bytes, at: int) -> int:
-        """Bytes of the package that begins at `at`; 0 where none does."""
-        if at + self.header > len(data) or (self.devices and self.device(data, at) not in self.devices):
-            return 0
-        if not self.second:
-            return self._sizes.get(data[at + 10], 0) if data[at + 1] == 5 and data[at + 9] <= 5 else 0
-        kind = data[at + 17]
-        length = _LENGTH.unpack_from(data, at + 18)[0]
-        fits = data[at + 6] <= 5 and kind in self._steps and 0 < length <= 1_500
-        return self.header + length if fits and length % self._steps[kind] == 0 else 0
-
-    def device(self, data: bytes, at: int = 0) -> int:
-        """What the package calls its device."""
-        return _LENGTH.unpack_from(data, at + 1)[0] if self.second else data[at]
-
-    def kind(self, data: bytes, at: int = 0) -> int:
-        """The data type."""
-        return data[at + (17 if self.second else 10)]
-
-    def samples(self, package: bytes) -> int:
-        """How many samples a package has."""
-        return (len(package) - self.header) // self._steps[self.kind(package)]
-
-    def candidates(self, data: bytes, start: int, stop: int) -> np.ndarray:
-        """Places in [start, stop) where a package may begin."""
-        last = min(stop, len(data) - self.header + 1)
-        if last <= start:
-            return np.zeros(0, dtype=np.int64)
-        byte = np.frombuffer(data, np.uint8)
-
-        def at(offset: int) -> np.ndarray:
-            return byte[start + offset : last + offset]
-
-        if self.second:
-            fits = (at(6) <= 5) & (at(17) <= 3) & (at(19) <= 5) & (at(20) == 0) & (at(21) == 0)
-        else:
-            fits = (at(1) == 5) & (at(9) <= 5) & (at(10) <= 8)
-        return np.flatnonzero(fits) + start
-
-    def follows(self, before: bytes, data: bytes, at: int) -> bool:
-        """Whether the package at `at` is of the lidar and kind of one before, within ten seconds of it."""
-        header = self.layout.header
-        old = np.frombuffer(before, header, 1)
-        new = np.frombuffer(data, header, 1, at)
-        for name in ("index", "version", "slot", "lidar", "lidar_type", "reserved", "clock", "kind"):
-            if name in (header.names or ()) and old[name] != new[name]:
-                return False
-        clock = self.layout.clocks.get(int(old["clock"][0]), "unknown")
-        first, second = (decode_stamps(h["stamp"], clock, self.layout.version)[0] for h in (old, new))
-        if clock == "pps":
-            return 0 <= second < 1_000_000_000
-        return bool(0 < second - first <= 10_000_000_000)
-
-    def plausible(self, package: bytes) -> bool:
-        """Whether its points are such as a lidar can see, or its inertial sample such as a rig can feel."""
-        kind = self.kind(package)
-        of = self.layout.kinds[kind]
-        samples = np.frombuffer(package, of.sample, offset=self.header)
-        with np.errstate(over="ignore", invalid="ignore"):
-            if of.form == "imu":
-                rate, force = decode_imu(samples)
-                return bool((np.abs(rate) < 100).all() and (np.abs(force) < 1_000).all())
-            return bool((np.linalg.norm(decode_points(of, samples)[0], axis=-1) <= FARTHEST_M).all())
 
 
 @dataclass
@@ -239,7 +156,7 @@ class Walk:
         three = self._three(at)
         if three is None or three[0] - self._base - at not in self._shifts:
             return False
-        return self._skip <= three[1] - three[0] <= _LONGEST_FRAME
+        return self._is_long(three)
 
     def _weak(self, at: int) -> bool:
         """Whether a header stands here whose offsets are wrong or moved: its number and what follows tell."""
@@ -248,16 +165,21 @@ class Walk:
             return False
         if not self._mark(three, self._index):
             return False
-        return self._chain(at + self._skip, 3 if self._index is None else 2, three[2])
+        first = self._index is None
+        sure = not first and three[2] == self._index + 1 and self._is_long(three)  # type: ignore[operator]
+        return self._chain(at + self._skip, 3 if first else 2, three[2], crumbs=sure, header=True)
 
     def _mark(self, three: tuple[int, int, int], before: int | None) -> bool:
-        """Whether numbers may be those of a header: its index is the next, or its length is one."""
-        current, following, index = three
-        long = self._skip <= following - current <= _LONGEST_FRAME
+        """Whether numbers may be those of a header: its index is the next, or its length may be one."""
+        long, index = self._is_long(three), three[2]
         if before is None:
             return long and index < 10_000_000
         step = index - before
-        return step == 1 or (long and 0 < step <= 10_000)
+        return step == 1 or (long and (0 < step <= 10_000 or index == 0))  # 0: another recording begins
+
+    def _is_long(self, three: tuple[int, int, int]) -> bool:
+        """Whether offsets make a frame that is neither shorter than its header nor endless."""
+        return self._skip <= three[1] - three[0] <= _LONGEST_FRAME
 
     def _header(self, at: int) -> bool:
         return self._strong(at) or self._weak(at)
@@ -270,27 +192,31 @@ class Walk:
             self.n_wrong_offsets += 1
         if shift not in self._shifts:
             self._shifts = [0, *self._shifts[1:][-2:], shift]
-        long = self._skip <= following - current <= _LONGEST_FRAME
+        long = self._is_long((current, following, index))
         self._frame_end = pos + (following - current if long else 0)
         self._index = index
         self.n_frames += 1
 
     # ------------------------------------------------------------------------------ damage
 
-    def _chain(self, at: int, links: int, index: int | None, crumbs: bool = True) -> bool:
+    def _chain(
+        self, at: int, links: int, index: int | None, crumbs: bool = True, header: bool = False
+    ) -> bool:
         """Whether so many packages follow one another from here on in frame `index`, or the file ends first.
 
-        Without `crumbs` it may not end with a few bytes that could be anything.
+        Without `crumbs` it may not end with a few bytes that could be anything. Behind a doubtful `header`
+        there is a package, not another doubtful header.
         """
         data = self._data
-        for _ in range(links):
+        for link in range(links):
             if at >= len(data) or at + self._test.header > len(data):
                 return self._ended and (crumbs or at == len(data))
             size = self._test.size(data, at)
             if not size:
                 three = self._three(at)
-                known = three is not None and index is not None
-                return self._strong(at) or (three is not None and known and self._mark(three, index))
+                if three is None or index is None or (header and not link):
+                    return self._strong(at)
+                return self._strong(at) or self._mark(three, index)
             at += size
         return True
 
@@ -335,7 +261,7 @@ class Walk:
             fits &= index < 10_000_000
         else:
             step = index - np.uint64(self._index)
-            fits = (fits & (step > 0) & (step <= 10_000)) | (step == 1)
+            fits = (fits & (((step > 0) & (step <= 10_000)) | (index == 0))) | (step == 1)
         return np.flatnonzero(fits) + start
 
     def _over_hole(self, frame: RawFrame, pos: int) -> int:
