@@ -192,7 +192,7 @@ def move_markers(moves: Sequence[Moves], every: Sequence[Moves]) -> Figure:
 
 def depth_histograms(runs: Sequence[Run], every: Sequence[Run]) -> Figure:
     """Signed depth residuals; a column a run."""
-    figure, panels = _grid(list(runs), 1, "Depth residuals", 1.75, "lidar returns")
+    figure, panels = _grid(list(runs), 1, "Depth residuals", 1.75, "markers with a depth")
     reach = _reach([100.0 * np.abs(_depths(run)) for run in every], 1.0)
     for axes, run in zip(panels[0], runs, strict=True):
         values = 100.0 * _depths(run)
@@ -208,7 +208,7 @@ def depth_histograms(runs: Sequence[Run], every: Sequence[Run]) -> Figure:
 
 
 def _depths(run: Run) -> np.ndarray:
-    return np.empty(0) if run.depth_residual is None else run.depth_residual
+    return np.empty(0) if run.depth_residual is None else _finite(run.depth_residual)
 
 
 # --- parts ---------------------------------------------------------------------------------------------

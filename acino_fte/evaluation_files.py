@@ -13,7 +13,7 @@ from acino_fte.evaluation_statistics import (
     Errors,
     Moves,
     Threshold,
-    depth_row,
+    depth_rows,
     error_rows,
     move_rows,
 )
@@ -40,9 +40,11 @@ def evaluation_tables(errors: Sequence[Errors], threshold: Threshold, moves: Seq
         checked = {m.run.name: int(m.looked_at.any(axis=1).sum()) if m.checked else 0 for m in moves}
         rows = [row for m in moves for row in move_rows(m)]
         tables.append(move_table(rows, checked, loose & set(checked)))
-    deep = [run for run in runs if run.depth_residual is not None]
+    deep = [run for run in runs if run.has_depth]
     if deep:
-        tables.append(depth_table([depth_row(run) for run in deep], loose & {run.name for run in deep}))
+        tables.append(
+            depth_table([row for run in deep for row in depth_rows(run)], loose & {run.name for run in deep})
+        )
     return tables
 
 

@@ -52,8 +52,9 @@ class Run:
         px, NaN where there is none.
     residual : (N, C, M, 2)
         Reprojected − detected, px.
-    depth_residual : (K,), optional
-        Depth of the trajectory − depth of the lidar, m, of the associated returns; None without a lidar.
+    depth_residual : (N, M), optional
+        Depth of the trajectory's surface − depth of the lidar, m; NaN where there is none. None where the
+        run has no lidar, or did not write them one by one.
     """
 
     folder: Path
@@ -78,6 +79,11 @@ class Run:
     def sequence(self) -> str:
         """Name of the recording."""
         return str(self.metrics.get("sequence", ""))
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether the run has depth residuals, one by one or as numbers in its metrics."""
+        return self.depth_residual is not None or bool(self.metrics.get("depth_m"))
 
     @cached_property
     def skeleton(self) -> Skeleton:
@@ -213,8 +219,7 @@ def open_run(folder: Path | str) -> Run:
 def _depth(dataset: xr.Dataset) -> np.ndarray | None:
     if "depth_residual" not in dataset:
         return None
-    values = np.asarray(dataset["depth_residual"].values, dtype=float).ravel()
-    return values[np.isfinite(values)]
+    return np.asarray(dataset["depth_residual"].transpose("time", "keypoints").values, dtype=float)
 
 
 def _check_folder(folder: Path) -> None:

@@ -195,17 +195,30 @@ def move_rows(moves: Moves) -> list[dict[str, Any]]:
     return rows
 
 
-def depth_row(run: Run) -> dict[str, Any]:
-    """Statistics of the depth residuals of a run with a lidar, m."""
-    values = run.depth_residual if run.depth_residual is not None else np.empty(0)
-    return {
-        **_about(run, "run", "all"),
-        "n": int(values.size),
-        "mean": _of(np.mean, values),
-        "median": _of(_median, values),
-        "sd": _of(np.std, values),
-        "rmse": rms(values),
-    }
+def depth_rows(run: Run) -> list[dict[str, Any]]:
+    """Statistics of the depth residuals of a run with a lidar, m: a dict for every row.
+
+    Of a run that wrote no residuals one by one, the numbers of its ``metrics.json`` for the whole run.
+    """
+    if run.depth_residual is None:
+        known = run.metrics.get("depth_m") or {}
+        whole = {"n": known.get("n", 0), "mean": known.get("bias"), "median": None}
+        return [{**_about(run, "run", "all"), **whole, "sd": known.get("std"), "rmse": known.get("rmse")}]
+    rows = []
+    for level, name, members in rows_of(run):
+        values = run.depth_residual[:, members]
+        values = values[np.isfinite(values)]
+        rows.append(
+            {
+                **_about(run, level, name),
+                "n": int(values.size),
+                "mean": _of(np.mean, values),
+                "median": _of(_median, values),
+                "sd": _of(np.std, values),
+                "rmse": rms(values),
+            }
+        )
+    return rows
 
 
 def rms(values: np.ndarray) -> float | None:

@@ -129,7 +129,7 @@ def depth_table(rows: list[dict[str, Any]], marked: Iterable[str] = ()) -> Table
         Column("sd", "SD (cm)", 2, 100.0),
         Column("rmse", "RMSE (cm)", 2, 100.0),
     )
-    notes = ("Depth of the trajectory − depth of the associated lidar return, along the camera's axis.",)
+    notes = ("Depth of the trajectory's surface − depth measured by the lidar, along the camera's axis.",)
     return Table("depth", "Depth residuals", columns, rows, notes, frozenset(marked))
 
 

@@ -15,7 +15,7 @@ from acino_fte.data_tools.deeplabcut import write_deeplabcut_csv
 from acino_fte.evaluation_figures import depth_histograms, error_histograms, error_markers
 from acino_fte.evaluation_labels import label_pixels, labels_of_runs, read_labels
 from acino_fte.evaluation_runs import open_run, open_runs
-from acino_fte.evaluation_statistics import Threshold, depth_row, error_rows, errors_of
+from acino_fte.evaluation_statistics import Threshold, depth_rows, error_rows, errors_of
 from acino_fte.evaluation_tables import as_csv, error_table, latex, markdown
 from acino_fte.result import Status
 
@@ -302,11 +302,22 @@ def test_depth_of_a_run_with_a_lidar(copied):
     values = np.full((STOP - START, 24), np.nan)
     values[0, :4] = [0.03, -0.01, 0.02, 0.04]
     run = open_run(with_depth(copied, values))
-    row = depth_row(run)
+    rows = {row["name"]: row for row in depth_rows(run)}
+    row = rows["all"]
     assert row["n"] == 4 and row["mean"] == pytest.approx(0.02) and row["median"] == pytest.approx(0.025)
     assert row["rmse"] == pytest.approx(np.sqrt(0.003 / 4))
+    assert rows["nose"]["n"] == 1 and rows["nose"]["mean"] == pytest.approx(0.03)
+    assert rows["r_hip"]["n"] == 0 and rows["r_hip"]["rmse"] is None
     (axes,) = depth_histograms([run], [run]).axes
     assert "n 4" in axes.texts[0].get_text()
+
+
+def test_depth_of_a_run_that_wrote_only_metrics(copied):
+    assert not open_run(copied).has_depth
+    edited(copied / "metrics.json", depth_m={"n": 9, "bias": 0.01, "std": 0.02, "rmse": 0.0224, "p90": 0.03})
+    run = open_run(copied)
+    (row,) = depth_rows(run)
+    assert run.has_depth and (row["n"], row["mean"], row["sd"], row["rmse"]) == (9, 0.01, 0.02, 0.0224)
 
 
 # --- tables and figures --------------------------------------------------------------------------------
