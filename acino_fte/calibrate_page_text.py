@@ -39,7 +39,7 @@ ACTIONS = r"""
   :data-pair="props.row.number" @click="$parent.$emit('choose', props.row.number)">
   <q-td v-for="column in props.cols" :key="column.name" :props="props"
     :class="{actions: column.name == 'actions', bad: column.name == 'error' && props.row.outlier}">
-    <template v-if="column.name != 'actions'">{{ column.value ?? '–' }}<span
+    <template v-if="column.name != 'actions'">{{ column.value }}<span
       v-if="column.name == 'error' && props.row.outlier"> outlier</span></template>
     <template v-else>
       <q-btn flat dense round size="sm" :icon="props.row.used ? 'visibility' : 'visibility_off'"
@@ -103,6 +103,20 @@ def facts(work: Work) -> tuple[str, str, str]:
     return headline, "\n".join(lines), "\n".join(solution.messages)
 
 
+def table_rows(work: Work, chosen: int | None) -> list[dict[str, Any]]:
+    """Rows of the table, as text; the chosen one is marked."""
+    return [
+        row
+        | {
+            "range": f"{row['range']:.2f}",
+            "error": _number(row["error"]),
+            "left_out": _number(row["left_out"]),
+            "chosen": row["number"] == chosen,
+        }
+        for row in work.rows()
+    ]
+
+
 def saved_text(written: object, work: Work) -> str:
     """What to say after saving."""
     if isinstance(written, str | Path):
@@ -110,6 +124,10 @@ def saved_text(written: object, work: Work) -> str:
     if isinstance(written, Iterable):
         return "Saved: " + ", ".join(str(one) for one in written)
     return f"Saved beside {work.path}"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
 
 
 def _dropped(count: int) -> str:

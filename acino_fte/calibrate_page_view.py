@@ -10,7 +10,7 @@ from nicegui import run, ui
 from nicegui.client import Client
 
 from acino_fte.calibrate_page_parts import STYLE, CloudView, ImageView
-from acino_fte.calibrate_page_text import ACTIONS, COLUMNS, HELP, facts, saved_text, step
+from acino_fte.calibrate_page_text import ACTIONS, COLUMNS, HELP, facts, saved_text, step, table_rows
 from acino_fte.calibrate_page_work import Work
 from acino_fte.errors import InputError
 from acino_fte.local_page import PageSession, show_error
@@ -316,7 +316,7 @@ class Tab:
         self.cloud.show(source=sources[1], marks=work.cloud_marks(self.image, self.chosen))
         width, height = work.placements[self.image].resolution
         self.image_title.set_text(f"{self.image} · {width} × {height} px")
-        self.table.rows = [row | {"chosen": row["number"] == self.chosen} for row in work.rows()]
+        self.table.rows = table_rows(work, self.chosen)
         self.undo.set_enabled(book.can_undo)
         self.redo.set_enabled(book.can_redo)
         self.step.set_text(step(work, self.image))

@@ -144,7 +144,7 @@ class Work:
                 "image": pair.image,
                 "pixel": "{:.1f}, {:.1f}".format(*pair.pixel),
                 "xyz": "{:.2f}, {:.2f}, {:.2f}".format(*pair.xyz),
-                "range": round(float(np.linalg.norm(pair.xyz)), 2),
+                "range": float(np.linalg.norm(pair.xyz)),
                 "used": pair.used,
                 "label": pair.label,
                 "error": None if live is None else _finite(np.linalg.norm(live[number - 1])),

@@ -22,7 +22,7 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-LIMIT = 10_000  # ms to wait for anything in the page
+LIMIT = 30_000  # ms to wait for anything in the page
 
 
 @pytest.fixture(scope="module")

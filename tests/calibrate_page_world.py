@@ -11,6 +11,13 @@ from acino_fte.data_tools.rotations import rotation_matrix
 WIDTH, HEIGHT = 640, 480
 IMAGES = ("near.png", "far.png")
 N_TARGETS = 9
+_INTRINSICS = """image_width: 640
+image_height: 480
+camera_name: cam1
+camera_matrix: {rows: 3, cols: 3, data: [900, 0, 322, 0, 900, 236, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
+"""
 _AXES = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]])  # the camera looks along the lidar's x
 
 
@@ -66,4 +73,5 @@ def write_world(folder: Path) -> list[str]:
         path = folder / image.replace("png", "npz")
         np.savez(path, xyz=xyz, intensity=intensity)
         arguments += ["--cloud", str(path)]
-    return [str(folder / image) for image in IMAGES] + arguments
+    (folder / "ost.yaml").write_text(_INTRINSICS)
+    return [str(folder / image) for image in IMAGES] + arguments + ["--camera", str(folder / "ost.yaml")]
