@@ -52,6 +52,7 @@ class BagReader:
             )
         self.path, self._imu_unit = Path(path), imu_unit
         self._units: dict[str, float] = {}
+        self._channels: dict[str, Channel] = {}  # of records of kind "other"
         self._notes: list[str] = []
         self._undecoded: dict[str, tuple[int, str]] = {}
         self._temporary: list[Path] = []
@@ -187,6 +188,7 @@ class BagReader:
     def _record(self, message: RawMessage, kind: Kind) -> Record | None:
         channel = message.channel
         if kind == "other":
+            self._channels[channel.topic] = channel
             return Record(channel.topic, kind, message.received_ns, None, message.data)
         try:
             if channel.layout is None:
@@ -200,6 +202,30 @@ class BagReader:
             self._undecoded[channel.topic] = (n + 1, why)
             return None
         return Record(channel.topic, kind, message.received_ns, value)
+
+    def fields(self, record: Record) -> dict[str, Any]:
+        """Fields of a record of kind ``"other"``, decoded by the definition that the bag (or ROS) has of it.
+
+        Returns
+        -------
+        dict
+            As :func:`acino_fte.data_tools.bags_serial.decode` gives them.
+
+        Raises
+        ------
+        InputError
+            There is no definition, or the bytes are not such a message.
+        """
+        channel = self._channels.get(record.stream)
+        try:
+            if channel is None or channel.layout is None or record.raw is None:
+                raise DecodeError("it was not read as bytes from this bag")
+            types = definitions(channel.type, channel.definition, channel.version, channel.encoding)
+            return decode(record.raw, channel.type, types, channel.layout)
+        except DecodeError as error:
+            raise InputError(
+                "The message does not decode.", file=self.path, key=record.stream, found=str(error)
+            ) from error
 
     def _unit(self, topic: str, fields: dict[str, Any]) -> float:
         """m/s² of one unit of the accelerations of a topic."""

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from acino_fte.data_tools.bags_serial import LAYOUTS
-from acino_fte.data_tools.bags_window import Channel, Losses, Messages, RawMessage
+from acino_fte.data_tools.bags_window import Channel, Losses, Messages, RawMessage, decompressor
 from acino_fte.data_tools.ros_messages import type_name
 
 MAGIC = b"SQLite format 3\0"
@@ -349,9 +349,8 @@ def _is_message(row: list[Any]) -> bool:
 
 def _unpacked(data: bytes) -> bytes:
     """A message that rosbag2 compressed by itself; as it is where it does not unpack."""
-    import zstandard
-
+    unpack = decompressor("zstd")
     try:
-        return zstandard.ZstdDecompressor().decompressobj().decompress(data)
-    except zstandard.ZstdError:
+        return unpack.decompress(data)
+    except Exception:  # noqa: BLE001 - the library's own errors
         return data

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bz2
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -84,16 +84,18 @@ class Window:
 
     Parameters
     ----------
-    read : callable
-        Gives up to so many bytes; none at the end.
-    end : int, optional
+    end : int
         Where the bytes end, as far as that is known: no record may reach beyond it.
     """
 
-    def __init__(self, read: Callable[[int], bytes], end: int) -> None:
-        self._read, self.end = read, end
+    def __init__(self, end: int) -> None:
+        self.end = end
         self._buffer, self._start = b"", 0  # the buffer, and what of it is used
         self.at = 0
+
+    def _read(self, n: int) -> bytes:
+        """Up to so many bytes of the source; none at its end."""
+        raise NotImplementedError
 
     def peek(self, n: int) -> memoryview:
         """The next bytes, `n` of them or up to the end."""
@@ -134,8 +136,11 @@ class FileWindow(Window):
     """A :class:`Window` over a file, which can also go elsewhere."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
-        super().__init__(lambda n: file.read(min(n, _MOST_READ)), size)
+        super().__init__(size)
         self._file = file
+
+    def _read(self, n: int) -> bytes:
+        return self._file.read(min(n, _MOST_READ))
 
     def seek(self, at: int) -> None:
         """Go to a place."""
@@ -184,11 +189,11 @@ class Unpacked(Window):
     """
 
     def __init__(self, outer: Window, size: int, compression: str, end: int) -> None:
-        super().__init__(self._more, end)
+        super().__init__(end)
         self._outer, self._left, self._unpack = outer, size, decompressor(compression)
         self.problem, self.used, self.checksum, self._given = "", 0, 0, 0
 
-    def _more(self, _: int) -> bytes:
+    def _read(self, n: int) -> bytes:
         while not self.problem and self._given < self.end and not self._unpack.eof:
             packed = self._outer.take(min(self._left, _BLOCK))
             if not packed:
@@ -251,7 +256,7 @@ class _Named:
         return b"".join(parts)
 
 
-_STEP = 4096
+_STEP = 1 << 16
 
 
 def decompressor(name: str) -> Any:

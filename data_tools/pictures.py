@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from acino_fte.data_tools.recording import Picture
+from acino_fte.data_tools.ros_images import load_cv2
 from acino_fte.data_tools.video import VIDEO_SUFFIXES, VideoReader
 from acino_fte.errors import InputError
 
@@ -113,8 +114,7 @@ class PictureFolder:
         InputError
             There is no such picture, or it cannot be read.
         """
-        import cv2
-
+        cv2 = load_cv2()
         if not 0 <= frame < len(self.files):
             raise InputError(
                 "There is no such picture.",

@@ -15,7 +15,8 @@ _CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 
 _CHANNELS |= {"rgba8": 4, "bgra8": 4, "8UC4": 4, "rgb16": 3, "bgr16": 3}
 
 
-def _cv2() -> Any:
+def load_cv2() -> Any:
+    """OpenCV, or an error that names the remedy."""
     try:
         import cv2
     except ImportError as error:
@@ -61,7 +62,7 @@ def picture_from_image(message: dict[str, Any]) -> np.ndarray:
 
 def mosaic_to_colours(pixels: np.ndarray, encoding: str) -> np.ndarray:
     """Colours (H, W, 3) of the mosaic (H, W) of a sensor; `encoding` such as ``bayer_rggb8``."""
-    cv2 = _cv2()
+    cv2 = load_cv2()
     pattern = _BAYER.get(encoding[6:10])
     if pattern is None:
         raise ValueError(f"the encoding '{encoding}' is not known")
@@ -76,7 +77,7 @@ def picture_from_compressed(message: dict[str, Any]) -> np.ndarray:
     ValueError
         The bytes are no image.
     """
-    cv2 = _cv2()
+    cv2 = load_cv2()
     data = np.ascontiguousarray(message["data"]).view(np.uint8)
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
@@ -106,7 +107,7 @@ def picture_to_message(pixels: np.ndarray) -> dict[str, Any]:
 
 def compressed_to_message(pixels: np.ndarray, form: str) -> dict[str, Any]:
     """Fields of a compressed image: `form` is ``"png"`` or ``"jpeg"``."""
-    cv2 = _cv2()
+    cv2 = load_cv2()
     pixels = np.asarray(pixels)
     suffix = {"png": ".png", "jpeg": ".jpg", "jpg": ".jpg"}.get(form)
     if suffix is None:

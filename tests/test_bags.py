@@ -3,11 +3,13 @@
 import io
 import shutil
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from acino_fte.data_tools import bags_serial
 from acino_fte.data_tools.bags import BagReader
 from acino_fte.data_tools.bags_serial import CDR, CUSTOM, ROS1, DecodeError, decode, definitions, encode
 from acino_fte.data_tools.bags_write import BagWriter
@@ -326,6 +328,33 @@ def test_other_types_come_as_bytes_and_what_does_not_decode_is_counted(tmp_path)
         assert sum(r.kind == "imu" for r in records) == 8
         assert reader.damage.n_lost == 1 and reader.damage.n_read == 12
         assert any("/imu: 1 message does not decode" in place for place in reader.damage.places)
+
+
+def test_other_types_decode_when_asked(tmp_path):
+    joints = {"header": {"stamp": {"sec": 5, "nanosec": 6}, "frame_id": "rig"}, "name": ["pan", "tilt"]}
+    joints |= {"position": np.array([0.5, -0.25]), "velocity": np.zeros(0), "effort": np.zeros(0)}
+    name = "sensor_msgs/msg/JointState"
+    with BagWriter(tmp_path / "x", 2, serialization="custom") as bag:
+        bag.write_raw("/pan", name, encode(joints, name, definitions(name, "", 2), CUSTOM), RECEIVED)
+        bag.write("/imu", IMU, RECEIVED)
+    with BagReader(tmp_path / "x") as reader:
+        other, inertial, _ = reader.records()
+        assert reader.fields(other)["position"].tolist() == [0.5, -0.25]
+        assert reader.fields(other)["name"] == ["pan", "tilt"]
+        with pytest.raises(InputError, match="does not decode"):
+            reader.fields(inertial)
+
+
+def test_a_missing_package_names_the_remedy(bags, tmp_path, monkeypatch):
+    for module in ("rosbags", "rosbags.typesys", "cv2", "lz4.frame"):
+        monkeypatch.setitem(sys.modules, module, None)
+    bags_serial._standard.cache_clear()
+    bags_serial.definitions.cache_clear()
+    for path, kinds in ((bags["ros1"], {"imu"}), (bags["ros1-lz4"], {"other"})):
+        with pytest.raises(InputError, match=r"acino-fte\[lidar\]"), BagReader(path) as reader:
+            list(reader.records(kinds=kinds))
+    with pytest.raises(InputError, match=r"acino-fte\[lidar\]"):
+        picture_from_compressed({"format": "jpeg", "data": np.zeros(9, np.uint8)})
 
 
 def test_lz4_chunks_of_mcap(tmp_path):
