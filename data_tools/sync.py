@@ -280,13 +280,13 @@ def from_motion(
 
     Parameters
     ----------
-    motion : (N - 1,)
-        Shift of the image from each frame to the next, px, as
-        :func:`acino_fte.data_tools.sync_events.image_motion` gives it.
+    motion : (N - 1,) or (N - 1, D)
+        From each frame to the next: as much as the image shifted, or components of its shift.
     fps : float
         Of the camera.
     imu_time, imu_motion : (K,)
-        s since `origin_ns`, and the length of the angular velocity.
+        s since `origin_ns`, and what turns the image: the length of the angular velocity, or (K, D) what
+        shifts the image by its components.
     expected, grid, origin_ns
         As in :func:`from_pivot`.
 
@@ -298,7 +298,7 @@ def from_motion(
     n = len(motion) + 1
     base = from_pivot(n, fps, (0, 0.0), pivot_sd_ms=0.0, expected=expected, grid=grid)
     middle = (base.frame_time[1:] + base.frame_time[:-1]) / 2
-    rate = motion / np.diff(base.frame_time)
+    rate = (motion.reshape(n - 1, -1).T / np.diff(base.frame_time)).T
     found: Event = lag_of(middle, rate, imu_time, imu_motion)
     return replace(
         base,

@@ -10,12 +10,14 @@ import numpy as np
 
 from acino_fte.errors import InputError
 
-_SIDE = 192  # px, of images in which motion is measured
-_BLOCKS = 24
+_SIDE = 480  # px, of images in which motion is measured
+_CORNERS, _FEWEST_CORNERS = 150, 8
+_BLOCKS = 12
 _BLUR = 2.0  # steps of the slower sensor, of both signals alike
 _LEAST_SIGMAS = 5.0
 _LEAST_CONTRAST = 1.3
-_LEAST_OVERLAP = 2.0  # s
+_FEWER_SIGMAS, _MORE_CONTRAST = 3.0, 3.0  # of short records
+_LEAST_OVERLAP = 1.0  # s
 _AROUND = 6  # frames on either side of a step
 
 
@@ -133,28 +135,49 @@ def knock(time: np.ndarray, force: np.ndarray) -> Event:
 
 
 def image_motion(pictures: Iterable[np.ndarray]) -> np.ndarray:
-    """Shift (N - 1,) of the whole image from each frame to the next, px of the full image.
+    """Shift (N - 1, 2) of the scene from each frame to the next, px of the full image.
 
-    By phase correlation (Kuglin and Hines 1975), OpenCV's.
+    The median over corners that are followed (Lucas and Kanade 1981 on pyramids, OpenCV's), so that an animal
+    before it does not matter; frames without enough corners are bridged.
     """
     import cv2
 
     last: Any = None
-    window: Any = None
-    scale = 1.0
-    out: list[float] = []
+    out: list[np.ndarray] = []
     for pixels in pictures:
-        grey: Any = pixels if pixels.ndim == 2 else pixels[..., 1]
+        grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
         scale = max(max(grey.shape) / _SIDE, 1.0)
-        size = (max(round(grey.shape[1] / scale), 8), max(round(grey.shape[0] / scale), 8))
-        small = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        if window is None:
-            window = cv2.createHanningWindow(size, cv2.CV_32F)
+        size = (max(round(grey.shape[1] / scale), 16), max(round(grey.shape[0] / scale), 16))
+        small: Any = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        small = small if small.dtype == np.uint8 else cv2.convertScaleAbs(small, alpha=1 / 256)
         if last is not None:
-            shift, _ = cv2.phaseCorrelate(last, small, window)
-            out.append(float(np.hypot(shift[0], shift[1])) * scale)
+            out.append(_shift(last, small) * scale)
         last = small
-    return np.array(out)
+    return _bridged(np.array(out).reshape(-1, 2))
+
+
+def _shift(before: Any, after: Any) -> np.ndarray:
+    """Median shift (2,) of corners, px; NaN without enough of them."""
+    import cv2
+
+    corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 6)
+    if corners is None or len(corners) < _FEWEST_CORNERS:
+        return np.full(2, np.nan)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy(), maxLevel=4)
+    good = status.ravel() == 1
+    if good.sum() < _FEWEST_CORNERS:
+        return np.full(2, np.nan)
+    return np.asarray(np.median((found - corners).reshape(-1, 2)[good], axis=0))
+
+
+def _bridged(values: np.ndarray) -> np.ndarray:
+    known = np.isfinite(values).all(axis=1)
+    if known.all():
+        return values
+    if not known.any():
+        return np.zeros_like(values)
+    at = np.arange(len(values))
+    return np.column_stack([np.interp(at, at[known], column[known]) for column in values.T])
 
 
 def lag_of(
@@ -162,15 +185,17 @@ def lag_of(
 ) -> Event:
     """By how much the clock of b is ahead of that of a, from one motion that both show: b(t + lag) ~ a(t).
 
-    The peak of the normalised cross-correlation (Knapp and Carter 1976) over all lags with two seconds of
+    The peak of the normalised cross-correlation (Knapp and Carter 1976) over all lags with one second of
     overlap or more, refined by its derivative. The standard deviation is the sandwich over blocks of time, so
     that errors may be correlated.
 
     Parameters
     ----------
-    time_a, a : (K,)
-        s, and the amount of motion.
-    time_b, b : (L,)
+    time_a : (K,)
+        s.
+    a : (K,) or (K, D)
+        Motion: an amount, or components.
+    time_b, b : (L,), (L,) or (L, D)
         The same of the other.
     step : float, optional
         Of the common samples, s; by default half the shorter step of the two.
@@ -198,11 +223,14 @@ def lag_of(
     far = np.abs(np.arange(len(score)) - best) > 3 * width
     rival = float(max(sigmas[far].max(), 0.0)) if far.any() else 0.0
     peak = float(sigmas[best])
-    if peak < _LEAST_SIGMAS or peak < _LEAST_CONTRAST * rival:
+    clear = peak >= _LEAST_SIGMAS and peak >= _LEAST_CONTRAST * rival
+    alone = peak >= _FEWER_SIGMAS and peak >= _MORE_CONTRAST * rival
+    if not (clear or alone):
         raise InputError(
             "The motion in the images and that of the inertial sensor do not tell when they were.",
-            expected=f"a correlation of {_LEAST_SIGMAS:g} sigma or more, {_LEAST_CONTRAST:g} times any other",
-            found=f"{score[best]:.2f}, which is {peak:.1f} sigma, and {rival:.1f} sigma at another time",
+            expected=f"a match of {_LEAST_SIGMAS:g} sigma, {_LEAST_CONTRAST:g} times any other, or of "
+            f"{_FEWER_SIGMAS:g} sigma, {_MORE_CONTRAST:g} times any other",
+            found=f"{peak:.1f} sigma (a correlation of {score[best]:.2f}), and {rival:.1f} at another time",
             remedy="give one event by hand: --pivot FRAME=SECONDS",
         )
     rough = grid_b[0] - grid_a[0] + lags[best] * step
@@ -213,11 +241,14 @@ def lag_of(
 def _resampled(
     time: np.ndarray, values: np.ndarray, step: float, blur: float
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Even times (I,) and blurred values (I, D), of mean 0 and of variance 1 all together."""
     from scipy.ndimage import gaussian_filter1d
 
     grid = np.arange(time[0], time[-1], step)
-    out = gaussian_filter1d(np.interp(grid, time, values), blur)
-    return grid, (out - out.mean()) / max(float(out.std()), 1e-12)
+    columns = np.asarray(values, dtype=float).reshape(len(time), -1).T
+    out = np.column_stack([gaussian_filter1d(np.interp(grid, time, one), blur) for one in columns])
+    out -= out.mean(axis=0)
+    return grid, out / max(float(np.sqrt(np.mean(out**2))), 1e-12)
 
 
 def _correlation(x: np.ndarray, y: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -225,21 +256,24 @@ def _correlation(x: np.ndarray, y: np.ndarray, least: int) -> tuple[np.ndarray, 
     from scipy.signal import correlate, correlation_lags
 
     lags = correlation_lags(len(y), len(x))
-    ones_x, ones_y = np.ones_like(x), np.ones_like(y)
+    ones_x, ones_y = np.ones(len(x)), np.ones(len(y))
     n = np.maximum(np.rint(correlate(ones_y, ones_x)), 1)
-    sum_x, sum_y = correlate(ones_y, x), correlate(y, ones_x)
-    var_x = correlate(ones_y, x**2) - sum_x**2 / n
-    var_y = correlate(y**2, ones_x) - sum_y**2 / n
-    score = (correlate(y, x) - sum_x * sum_y / n) / np.sqrt(np.maximum(var_x * var_y, 1e-9 * n**2))
+    product, var_x, var_y = (np.zeros(len(lags)) for _ in range(3))
+    for one, other in zip(x.T, y.T, strict=True):
+        sum_x, sum_y = correlate(ones_y, one), correlate(other, ones_x)
+        product += correlate(other, one) - sum_x * sum_y / n
+        var_x += correlate(ones_y, one**2) - sum_x**2 / n
+        var_y += correlate(other**2, ones_x) - sum_y**2 / n
+    score = product / np.sqrt(np.maximum(var_x * var_y, 1e-9 * n**2))
     keep = n >= max(least, 0.25 * min(len(x), len(y)))
     return score[keep], n[keep], lags[keep]
 
 
 def _width(x: np.ndarray) -> int:
-    """Samples after which a signal is like itself by half, at most."""
+    """Samples after which a signal (I, D) is like itself by half, at most."""
     from scipy.signal import correlate
 
-    self_likeness = correlate(x, x)[len(x) - 1 :]
+    self_likeness = sum(correlate(one, one)[len(x) - 1 :] for one in x.T)
     below = np.flatnonzero(self_likeness < 0.5 * self_likeness[0])
     return int(below[0]) if len(below) else len(x)
 
@@ -254,14 +288,15 @@ def _refined(
     sd = np.inf
     for _ in range(12):
         t = grid_a[(grid_a + lag >= grid_b[0] + step) & (grid_a + lag <= grid_b[-1] - step)]
-        mine = np.interp(t, grid_a, x)
-        other = np.interp(t + lag, grid_b, y)
-        mine, other = mine - mine.mean(), other - other.mean()
-        slope, other_slope = np.gradient(mine, step), np.gradient(other, step)
-        score = slope * (other - float(mine @ other) / max(float(mine @ mine), 1e-12) * mine)
-        turn = max(float(slope @ other_slope), 1e-12)
+        mine = np.column_stack([np.interp(t, grid_a, one) for one in x.T])
+        other = np.column_stack([np.interp(t + lag, grid_b, one) for one in y.T])
+        mine, other = mine - mine.mean(axis=0), other - other.mean(axis=0)
+        slope, other_slope = np.gradient(mine, step, axis=0), np.gradient(other, step, axis=0)
+        gain = float((mine * other).sum()) / max(float((mine**2).sum()), 1e-12)
+        score = (slope * (other - gain * mine)).sum(axis=1)
+        turn = max(float((slope * other_slope).sum()), 1e-12)
         blocks = np.array([part.sum() for part in np.array_split(score, _BLOCKS)])
-        sd = float(np.sqrt(blocks @ blocks)) / turn
+        sd = float(np.sqrt(blocks @ blocks * _BLOCKS / (_BLOCKS - 4))) / turn
         change = float(np.clip(-score.sum() / turn, -3 * step, 3 * step))
         lag += change
         if abs(change) < 1e-3 * step:
