@@ -67,6 +67,8 @@ class Walk:
         self._index: int | None = None
         self._frame_end = start
         self._tail = -1  # where the last package ends
+        self._head = -1  # where the last header ends
+        self._index_before: int | None = None
         self._last: dict[tuple[int, int], bytes] = {}
         self._before: tuple[tuple[int, int], bytes | None] = (0, 0), None  # what the last package replaced
         self._bytes = self._count = 0
@@ -194,7 +196,8 @@ class Walk:
             self._shifts = [0, *self._shifts[1:][-2:], shift]
         long = self._is_long((current, following, index))
         self._frame_end = pos + (following - current if long else 0)
-        self._index = index
+        self._index_before, self._index = self._index, index
+        self._head = pos + self._skip
         self.n_frames += 1
 
     # ------------------------------------------------------------------------------ damage
@@ -268,7 +271,12 @@ class Walk:
         """Note what cannot be read from `pos` on; where the walk goes on."""
         start, why = pos, self._why(pos)
         last = frame.packages[-1][2] if frame.packages and self._tail == pos else b""
-        stop, damaged = self._within(pos, last) if last else (self._resync(pos + 1), False)
+        if last:
+            stop, damaged = self._within(pos, last)
+        else:
+            stop, damaged = self._resync(pos - self._skip + 1 if self._head == pos else pos + 1), False
+        if stop < pos and not last:  # bytes are missing in the header before
+            start, self._index = pos - self._skip, self._index_before
         if damaged:
             frame.packages.pop()
             start -= len(last)

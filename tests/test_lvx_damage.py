@@ -88,6 +88,21 @@ def test_damage_in_the_middle(whole, tmp_path, how):
         assert damage.n_read + damage.n_lost == len(all_packages), (start, length, damage)
 
 
+def test_bytes_lost_from_a_header(whole, tmp_path):
+    """One or two bytes of a frame's header are gone: its packages and those before it are not."""
+    version, data, all_packages, _ = whole
+    path = tmp_path / "damaged.lvx"
+    stops = {stop for _, stop, *_ in all_packages}
+    first = [start for start, *_ in all_packages if start not in stops][3]
+    size = LAYOUTS[version].frame_bytes
+    for at in range(first - size, first - 1, 3):
+        for length in (1, 2):
+            path.write_bytes(data[:at] + data[at + length :])
+            reader = LvxReader(path)
+            assert_read(reader, whole, [True] * len(all_packages), exactly=True)
+            assert reader.damage.n_read == len(all_packages) and reader.damage.n_lost == 0
+
+
 def test_two_damages_and_a_package_alone_between(whole, tmp_path):
     """It is known by the lidar's earlier ones."""
     version, data, all_packages, _ = whole
