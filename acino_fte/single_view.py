@@ -38,7 +38,10 @@ _WINDOW = 0.25  # s: the depth of the animal is a median over this to either sid
 _SPREAD = 0.06  # m, of detections about the skeleton in the start
 _FLAT_SD = 0.5  # m, of the depth of a marker that is only known to belong to the animal
 _MOST = 40  # frames in a start
-_ON_BODY = 0.06  # m: returns so near to the drawn skeleton are on the animal, as a rule
+_ON_BODY = 0.04  # m: returns so near to the drawn skeleton are on the animal, as a rule
+_ON = tuple(np.log([0.6 / 1.0, 0.35 / 30.0, 0.05 / 30.0]))  # 1/m: on it, behind it, before it
+_SIZE_SD = 0.15  # how far from the species' size an animal is, and how wrong a size in the image
+_DRIFT = 0.05  # per √s: how the error of the size changes while the animal turns
 _TOLERANCE = 0.6  # m: half the depth of an animal and its lean
 _ENOUGH = 3e-3  # relative decrease of the objective per iteration below which the start is good enough
 _ITERATIONS = 25  # a right heading is there after ten
@@ -107,14 +110,55 @@ def animal_depth(sequence: Sequence, kinematics: Kinematics, pixels: np.ndarray)
     size = depth_from_size(kinematics, flat, sequence.fps)
     if sequence.lidar is None:
         return size
-    on_body = _returns_on_skeleton(sequence, skeleton, flat, size)
-    if on_body is None:
+    frame, depth = _returns_on_skeleton(sequence, skeleton, flat, size)
+    if not len(frame):
         return size
-    frame, depth = on_body
-    ratio = _mode(depth / size[frame], _TOLERANCE / float(np.median(size)))
-    near = np.abs(depth - ratio * size[frame]) < _TOLERANCE
-    rough = _running_median(frame[near], depth[near] / size[frame[near]], len(size), sequence.fps)
-    return rough * size + float(np.median(surface_prior(skeleton)[0]))
+    ratio = surface_ratio(frame, depth / size[frame], size, sequence.fps)
+    near = np.abs(depth - (ratio * size)[frame]) < _TOLERANCE
+    if near.any():
+        ratio = _running_median(frame[near], depth[near] / size[frame[near]], len(size), sequence.fps)
+    return ratio * size + float(np.median(surface_prior(skeleton)[0]))
+
+
+def surface_ratio(frame: np.ndarray, ratio: np.ndarray, size: np.ndarray, fps: float) -> np.ndarray:
+    """What the animal's depth is to the depth that its size suggests (N,), by dynamic programming.
+
+    Returns on the drawn skeleton (``frame`` (K,), ``ratio`` (K,) of their depth to ``size`` (N,), m) are on
+    the animal, or behind it where they have missed a limb, and seldom before it. On a grid of ratios, the
+    log-likelihood of the returns about every frame, a broad prior on the size and a slow change from frame to
+    frame are added up, and the best path is kept (Viterbi 1967).
+    """
+    step = 0.5 * _TOLERANCE / float(np.median(size))
+    grid = np.arange(*_SIZES, step)
+    width = _TOLERANCE / size
+    reach = max(1.0, _WINDOW * fps)
+    score = np.empty((len(size), len(grid)))
+    order = np.argsort(frame, kind="stable")
+    frame, ratio = frame[order], ratio[order]
+    for n in range(len(size)):
+        first, last = np.searchsorted(frame, [n - reach, n + reach])
+        values = np.sort(ratio[first:last])
+        lower, upper = np.searchsorted(values, grid - width[n]), np.searchsorted(values, grid + width[n])
+        within, behind, before = upper - lower, len(values) - upper, lower
+        score[n] = within * _ON[0] + behind * _ON[1] + before * _ON[2]
+    score /= max(1.0, 2 * reach)  # a return counts in every window that it lies in, and once in all
+    score -= 0.5 * (np.log(grid) / _SIZE_SD) ** 2 / len(size)
+    change = np.minimum(0.5 * ((grid[:, None] - grid) / (_DRIFT / np.sqrt(fps))) ** 2, 50.0)
+    return grid[_best_path(score, change)]
+
+
+def _best_path(score: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Cells (N,) of the path with the most Σ score (N, G) − Σ change (G, G)."""
+    total, origin = score[0], np.zeros(score.shape, dtype=int)
+    for n in range(1, len(score)):
+        reached = total[:, None] - change
+        origin[n] = reached.argmax(axis=0)
+        total = reached.max(axis=0) + score[n]
+    path = np.empty(len(score), dtype=int)
+    path[-1] = total.argmax()
+    for n in range(len(score) - 1, 0, -1):
+        path[n - 1] = origin[n, path[n]]
+    return path
 
 
 def depth_from_size(kinematics: Kinematics, flat: np.ndarray, fps: float) -> np.ndarray:
@@ -157,8 +201,8 @@ def _rigid_links(kinematics: Kinematics) -> tuple[np.ndarray, np.ndarray]:
 
 def _returns_on_skeleton(
     sequence: Sequence, skeleton: Skeleton, flat: np.ndarray, size: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Frames and depths of returns that lie, in the image, on links whose both ends are detected."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frames (K,) and depths (K,), m, of returns on links, in the image, whose both ends are detected."""
     lidar = sequence.lidar
     assert lidar is not None
     place = lidar.time * sequence.fps - sequence.frames[0]
@@ -185,15 +229,7 @@ def _returns_on_skeleton(
         gap = np.linalg.norm(seen - start - u[:, None] * way, axis=-1) * size[frame]
         nearest = np.fmin(nearest, gap)
     on_body = nearest < _ON_BODY
-    return (frame[on_body], local[on_body, 2]) if on_body.any() else None
-
-
-def _mode(values: np.ndarray, width: float) -> float:
-    """The centre of the window of a width that holds the most values; the median of them."""
-    ordered = np.sort(values)
-    last = np.searchsorted(ordered, ordered + width, side="right")
-    first = int(np.argmax(last - np.arange(len(ordered))))
-    return float(np.median(ordered[first : last[first]]))
+    return frame[on_body], local[on_body, 2]
 
 
 def _running_median(
