@@ -13,19 +13,19 @@ const COLOURS = { left: '#3aa0e8', right: '#f0883e', middle: '#2fc79a' };
 const NEAR = 11, GRASP = 16;
 const by = (id) => document.getElementById(id);
 let about, data = null, wanted, marker = 0, active = 0, asked = 0, shown = { detections: true };
-let views = [], drag = null, pending = null, answering = 0, wheel = null;
+let views = [], solo = false;
+let drag = null, pending = null, answering = 0, wheel = null;
 const images = new Map();
 
 function tell(what) { emitEvent('adjust', what); }
 
 function start(given, first) {
   about = given;
-  const grid = by('adjust-views'), n = about.views.length;
-  const columns = n === 1 ? 1 : n <= 4 ? 2 : 3;
-  grid.style.gridTemplateColumns = `repeat(${n === 2 ? stacked() : columns}, minmax(0, 1fr))`;
+  const grid = by('adjust-views');
   grid.style.gridAutoRows = 'minmax(0, 1fr)';
   grid.replaceChildren();
   views = about.views.map((v, i) => makeView(grid, v, i));
+  arrange();
   const slider = by('adjust-slider');
   [slider.min, slider.max] = about.frames;
   slider.oninput = () => go(+slider.value);
@@ -41,6 +41,12 @@ function start(given, first) {
   receive(first);
 }
 
+function arrange() {  // all views, or the active one alone
+  const n = solo ? 1 : views.length, columns = n === 1 ? 1 : n === 2 ? stacked() : n <= 4 ? 2 : 3;
+  by('adjust-views').style.gridTemplateColumns = `repeat(${columns}, minmax(0, 1fr))`;
+  for (const v of views) v.box.style.display = solo && v.i !== active ? 'none' : '';
+  fitAll();
+}
 function stacked() {  // two views: side by side, or one above the other, whichever shows them larger
   const { clientWidth: w, clientHeight: h } = by('adjust-views'), [a, b] = about.views[0].size;
   return Math.min(w / 2 / a, h / b) > Math.min(w / a, h / 2 / b) ? 2 : 1;
@@ -169,6 +175,7 @@ function context(canvas) {
 }
 function draw() { for (const v of views) drawView(v); }
 function drawView(v) {
+  if (!v.box.clientWidth) return;
   const g = context(v.canvas);
   v.box.classList.toggle('active', v.i === active && views.length > 1);
   const [x0, y0] = toCanvas(v, [-0.5, -0.5]), s = scaleOf(v), [w, h] = v.size;
@@ -406,6 +413,7 @@ const KEYS = {
   Home: () => go(about.frames[0]), End: () => go(about.frames[1]),
   n: () => act('next'), N: () => act('previous'), r: () => act('reset'), Delete: () => act('reset'),
   c: () => act('check'), f: followAll, 0: resetZoom, '+': () => zoomActive(1.25), '-': () => zoomActive(0.8),
+  v: () => { solo = !solo; arrange(); },
   d: () => { shown.detections = !shown.detections; draw(); },
 };
 function key(e) {

@@ -57,9 +57,9 @@ SIDE = """
 """
 KEYS = """
 <div id="adjust-keys"><b>drag</b> in the image · <b>shift+drag</b>, <b>wheel</b> on it: depth ·
-<b>wheel</b> beside: zoom · <b>double click</b>: put it there · <b>← → PgUp PgDn Home End</b> ·
-<b>Tab</b> marker · <b>N</b> large residual · <b>Ctrl Z Y</b> undo redo · <b>R</b> reset · <b>C</b> checked ·
-<b>F</b> follow · <b>0</b> whole · <b>D</b> crosses</div><div id="adjust-problem"></div>
+<b>wheel</b> beside: zoom · <b>double click</b>: put it there · <b>← → PgUp PgDn</b> · <b>Tab</b> marker ·
+<b>N</b> large residual · <b>Ctrl Z Y</b> · <b>R</b> reset · <b>C</b> checked · <b>F</b> follow ·
+<b>0</b> whole · <b>V</b> one view · <b>D</b> crosses</div><div id="adjust-problem"></div>
 """
 FRAME = """<input id="adjust-frame" type="text" inputmode="numeric" aria-label="frame" title="Frame">"""
 SLIDER = """<input id="adjust-slider" type="range" step="1" aria-label="frame" tabindex="-1">"""

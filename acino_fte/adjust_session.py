@@ -141,6 +141,12 @@ class AdjustSession:
         shown = np.stack([self._project(camera, row, points) for camera in self.run.cameras])
         return _largest(np.linalg.norm(shown - self.run.detection[row], axis=-1), 0)
 
+    def _all_residuals(self) -> np.ndarray:
+        """(N, M) the same for all frames."""
+        run, positions = self.run, self.document.positions()
+        shown = [camera.project(positions + self._shift[camera.name]) for camera in run.cameras]
+        return _largest(np.linalg.norm(np.stack(shown, axis=1) - run.detection, axis=-1), 1)
+
     def _usual_large(self) -> float:
         worst = _largest(np.linalg.norm(self.run.residual, axis=-1), (1, 2))
         worst = worst[np.isfinite(worst)]
@@ -239,14 +245,12 @@ class AdjustSession:
 
         Residuals are those of the adjusted positions; frames that are checked are passed over.
         """
-        positions, run = self.document.positions(), self.run
-        rows = range(self._row(frame) + direction, len(run.frames) if direction > 0 else -1, direction)
+        residual, frames = self._all_residuals(), self.run.frames
+        worst = _largest(residual, 1)
+        rows = range(self._row(frame) + direction, len(frames) if direction > 0 else -1, direction)
         for row in rows:
-            if int(run.frames[row]) in self.document.checked:
-                continue
-            residual = self._residuals(row, positions[row])
-            if np.isfinite(residual).any() and np.nanmax(residual) > self.large_px:
-                return int(run.frames[row]), run.markers[int(np.nanargmax(residual))]
+            if worst[row] > self.large_px and int(frames[row]) not in self.document.checked:
+                return int(frames[row]), self.run.markers[int(np.nanargmax(residual[row]))]
         return None
 
     def save(self) -> None:

@@ -1,7 +1,7 @@
 """The page of adjustments in a real browser: one server and one tab for the whole file, in order."""
 
 import json
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +35,13 @@ def place(browser, tmp_path_factory):  # noqa: F811 - skips before anything is m
 @pytest.fixture(scope="module")
 def page(browser, place):  # noqa: F811
     """The served process, its file, and a tab that is open and has its first frame."""
-    arguments = [str(place / "run"), "--no-browser", "--images", f"cam2={place / 'images'}"]
+    with opened_page(browser, place, "--images", f"cam2={place / 'images'}") as opened:
+        yield opened
+
+
+@contextmanager
+def opened_page(browser, place, *options):  # noqa: F811
+    arguments = [str(place / "run"), "--no-browser", *options]
     with ExitStack() as stack:
         patch = stack.enter_context(pytest.MonkeyPatch.context())
         patch.setenv("PYTHONPATH", ENVIRONMENT["PYTHONPATH"])
@@ -228,8 +234,18 @@ def test_frames_are_checked_and_jumped_to(page):
     assert json.loads(page.path.read_text(encoding="utf-8"))["checked"] == [START + 3, START + 5]
 
 
-def test_a_killed_server_has_lost_nothing(page):
-    """Last in the file: SIGKILL right after a change was seen."""
+def test_one_view_alone(page):
+    widths = "[...document.querySelectorAll('.adjust-view')].map((v) => v.clientWidth)"
+    whole = page.ask(widths)
+    page.page.keyboard.press("v")
+    alone_ = page.ask(widths)
+    assert alone_[0] > 1.9 * whole[0] and alone_[1:] == [0, 0]
+    page.page.keyboard.press("v")
+    assert page.ask(widths) == whole
+
+
+def test_a_killed_server_has_lost_nothing_and_work_goes_on(page, browser):  # noqa: F811
+    """Last in the file: SIGKILL right after a change was seen; then the page again, to its end."""
     m = alone(page, START + 7)
     page.drag("cam1", m, 15, 9)
     page.until("adjust.data.n_adjusted === 3")
@@ -240,3 +256,10 @@ def test_a_killed_server_has_lost_nothing(page):
     assert set(document.entries) >= {(START + 7, run.markers[m])} and len(document.entries) == 3
     assert [p.name for p in page.place.glob(".*")] == []
     assert not page.tab.complaints
+    with opened_page(browser, page.place) as again:
+        assert again.ask("adjust.data.n_adjusted") == 3
+        again.page.locator(".adjust-done").click()
+        again.page.wait_for_selector("#farewell")
+        assert again.server.process.wait(timeout=20) == 0
+    table = (page.place / "run.adjustments.csv").read_text(encoding="utf-8").splitlines()
+    assert sum(line.split(",")[6] == "1" for line in table[1:]) == 3
