@@ -8,6 +8,8 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+from acino_fte.data_tools.bags_ecal import MAGIC as HDF5_MAGIC
+from acino_fte.data_tools.bags_ecal import EcalWalk
 from acino_fte.data_tools.bags_mcap import MAGIC as MCAP_MAGIC
 from acino_fte.data_tools.bags_mcap import McapWalk
 from acino_fte.data_tools.bags_ros1 import Ros1Walk
@@ -34,7 +36,7 @@ class BagReader:
     ----------
     path : Path
         ROS 1: a ``.bag`` (plain, bz2, lz4). ROS 2: the folder, or one ``.db3`` or ``.mcap`` file of it.
-        Messages as ROS 1 writes them, as CDR, or as rosbag2 writes under eCAL.
+        Messages as ROS 1 writes them, as CDR, or as rosbag2 writes under eCAL; and eCAL's own .hdf5 files.
     imu_unit : {"auto", "g", "m/s2"}
         Of accelerations. ROS wants m/s², Livox writes g. ``"auto"`` tells by the first one of each topic, and
         :attr:`notes` says so.
@@ -83,9 +85,11 @@ class BagReader:
                 expected="a ROS 1 bag, an SQLite file of rosbag2 or an MCAP file",
                 found=f"{size} bytes of something else" if size else "an empty file",
             )
+        if bag_kind(self.path) != "zstd":
+            self._walk(self.path, Losses())  # says so at once where it is of a version that is not read
         return [self.path]
 
-    def _walk(self, path: Path, losses: Losses) -> Ros1Walk | McapWalk | SqliteWalk | None:
+    def _walk(self, path: Path, losses: Losses) -> Ros1Walk | McapWalk | SqliteWalk | EcalWalk | None:
         kind = bag_kind(path)
         if kind == "zstd":
             path = self._unpack(path, losses)
@@ -96,6 +100,8 @@ class BagReader:
             return McapWalk(path, losses)
         if kind == "sqlite":
             return SqliteWalk(path, losses)
+        if kind == "ecal":
+            return EcalWalk(path, losses)
         losses.note(f"{path.name} is no bag: its first bytes are lost", 0, path.stat().st_size)
         return None
 
@@ -256,7 +262,7 @@ class BagReader:
         self._clean()
 
 
-def bag_kind(path: Path) -> Literal["ros1", "mcap", "sqlite", "zstd"] | None:
+def bag_kind(path: Path) -> Literal["ros1", "mcap", "sqlite", "ecal", "zstd"] | None:
     """What kind of a bag a file is, by its first bytes; None of another file."""
     with path.open("rb") as file:
         head = file.read(16)
@@ -266,4 +272,6 @@ def bag_kind(path: Path) -> Literal["ros1", "mcap", "sqlite", "zstd"] | None:
         return "mcap"
     if head.startswith(_ZSTD):
         return "zstd"
+    if head.startswith(HDF5_MAGIC):
+        return "ecal"
     return "sqlite" if head == SQLITE_MAGIC else None

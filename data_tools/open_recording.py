@@ -9,7 +9,7 @@ from acino_fte.data_tools.bags import BagReader, bag_kind
 from acino_fte.data_tools.recording import RecordingReader
 from acino_fte.errors import InputError, did_you_mean
 
-_EXPECTED = "LVX or LVX2, a ROS 1 bag, a ROS 2 bag (folder, .db3, .mcap) or a video"
+_EXPECTED = "LVX or LVX2, a ROS 1 bag, a ROS 2 bag (folder, .db3, .mcap), eCAL's .hdf5 or a video"
 _SUFFIXES = (".lvx", ".lvx2", ".bag", ".db3", ".mcap", ".mp4", ".mkv", ".avi", ".mov")
 _LVX = b"livox_tech"
 _LVX_NUMBER = bytes.fromhex("67a70eac")
@@ -121,7 +121,6 @@ def _what(head: bytes) -> str:
         (b"\xff\xd8\xff", "a JPEG image"),
         (b"PK\x03\x04", "a ZIP archive"),
         (b"\x1f\x8b", "a gzip archive"),
-        (b"\x89HDF", "an HDF5 file"),
         (b"ply", "a PLY point cloud"),
         (b"# .PCD", "a PCD point cloud"),
         (b"%PDF", "a PDF"),
