@@ -112,7 +112,7 @@ class LvxReader:
         self._reading = reading = _Reading(self._head, self._test)
         with open_binary(self.path) as file:
             reading.walk = Walk(file, self._test, self._head.start)
-            for frame in reading.walk.frames():
+            for frame in reading.frames():
                 for record in reading.records(frame):
                     if (kinds is None or record.kind in kinds) and (
                         streams is None or record.stream in streams
@@ -168,6 +168,8 @@ class _Reading:
         self._errors = ErrorLog()
         self._clocks: dict[str, set[str]] = {}
         self._last_pps: dict[int, int] = {}
+        self._held: dict[tuple[int, bool, int], list[tuple[int, bytes]]] = {}
+        self._final = False
         self._n_read = self._n_far = 0
 
     def index(self, number: int) -> int:
@@ -179,9 +181,16 @@ class _Reading:
         self.devices.setdefault(index, LvxDevice(index, type=None))
         return index
 
+    def frames(self) -> Iterator[RawFrame]:
+        """The frames of the walk, and an empty one at the end for the packages that wait."""
+        if self.walk is not None:
+            yield from self.walk.frames()
+        self._final = True
+        yield RawFrame()
+
     def records(self, frame: RawFrame) -> Iterator[Record]:
         """One record of every device's returns and of its inertial samples."""
-        groups: dict[tuple[int, bool, int], list[tuple[int, bytes]]] = {}
+        groups, self._held = self._held, {}
         clock_at = 6 if self._layout.version == "2" else 9
         imu_kind = self._layout.imu_kind
         for number, kind, package in frame.packages:
@@ -194,6 +203,8 @@ class _Reading:
             name = f"{'imu' if imu else 'lidar'}{index}"
             self._clocks.setdefault(name, set()).add(clock)
             tables, stamps, keep = self._tables(index, name, imu, packages, clock)
+            if self._logs[name].held:
+                self._held[number, imu, code] = packages[-1:]
             value = self._imu(tables, stamps, keep, clock) if imu else None
             if not imu:
                 value = self._lidar(index, name, tables, stamps, keep, clock)
@@ -223,7 +234,7 @@ class _Reading:
                 self._errors.add(index, table["header"]["error"])
         if clock == "pps":
             stamps = self._counted_on(index, stamps)
-        return tables, stamps, self._log(index, name, imu).add(stamps, samples)
+        return tables, stamps, self._log(index, name, imu).add(stamps, samples, self._final)
 
     def _log(self, index: int, name: str, imu: bool) -> StampLog:
         if name not in self._logs:

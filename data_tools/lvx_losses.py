@@ -35,12 +35,15 @@ class StampLog:
         Of the stream.
     step : float, optional
         ns between two samples, of the device's type; None where that is not known: it is estimated then.
+    held : bool
+        Whether the last package taken waits for the next ones.
     n_lost : int
         Packages missing between others.
     """
 
     name: str
     step: float | None = None
+    held: bool = False
     n_lost: int = 0
     n_gaps: int = 0
     n_outliers: int = 0
@@ -54,16 +57,22 @@ class StampLog:
         """Between two samples, ns; of a lidar that nothing is known of, that of a Tele-15."""
         return self._estimate or self.step or 4_167.0
 
-    def add(self, stamps: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    def add(self, stamps: np.ndarray, samples: np.ndarray, final: bool = False) -> np.ndarray:
         """Take the stamps (P,) int64 of further packages of so many samples (P,).
 
         Returns
         -------
         (P,) bool
             False where the stamp is damaged: far from those before and behind, which are near each other.
+            A last one that is far from the one before is `held`: it is to be given again with the next ones,
+            unless these are the `final` ones.
         """
+        n_before = 0 if self._last is None else 1
         if self._last is not None:
             stamps, samples = np.r_[self._last[0], stamps], np.r_[self._last[1], samples]
+        self.held = not final and len(stamps) > 1 and abs(int(stamps[-1]) - int(stamps[-2])) > _OUTLIER_NS
+        if self.held:
+            stamps, samples = stamps[:-1], samples[:-1]
         keep = _no_outliers(stamps)
         self.n_outliers += int((~keep).sum())
         stamps, samples = stamps[keep], samples[keep]
@@ -71,10 +80,9 @@ class StampLog:
             self.first_ns = int(stamps[0])
         self._learn(stamps, samples)
         self._count(stamps, samples)
-        out = keep if self._last is None else keep[1:]
         if len(stamps):
             self._last = int(stamps[-1]), int(samples[-1])
-        return out
+        return np.r_[keep[n_before:], [False] * self.held].astype(bool)
 
     def _learn(self, stamps: np.ndarray, samples: np.ndarray) -> None:
         """Estimate the step where the type of the device does not tell it, or tells it wrong.
