@@ -10,6 +10,7 @@ from acino_fte import (
     cli_run,
     cli_scene,
     cli_simulate,
+    cli_simulate_rig,
     cli_simulate_scene,
     cli_skeleton,
 )
@@ -27,6 +28,7 @@ app.command("match")(cli_match.match)
 app.command("scene")(cli_scene.scene)
 app.command("simulate")(cli_simulate.simulate)
 app.command("simulate-scene")(cli_simulate_scene.simulate_scene)
+app.command("simulate-rig")(cli_simulate_rig.simulate_rig)
 app.add_typer(cli_skeleton.app, name="skeleton")
 
 
