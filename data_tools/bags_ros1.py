@@ -38,6 +38,7 @@ _NEEDED = {
 }
 _MOST_HEAD = 1 << 16
 _BACK = 512  # bytes before the field `op` in which its head begins
+_MOST_CHUNK = 1 << 31
 _SCAN = 1 << 20
 _OP = re.compile(rb"\x04\0\0\0op=[\x02-\x07]", re.DOTALL)
 
@@ -200,6 +201,8 @@ class Ros1Walk:
         try:
             size = struct.unpack("<I", fields[b"size"])[0]
             room = min(length, self._file_end - data_at)
+            if not length and not known:  # a recorder that is killed has not come back to write the lengths
+                room, size = self._file_end - data_at, _MOST_CHUNK
             inner = Unpacked(window, room, compression, size)
         except ValueError as error:
             self.losses.note(f"the chunk at byte {start} is not read: {error}", 0, length)

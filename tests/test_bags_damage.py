@@ -228,6 +228,22 @@ def test_lost_messages_are_counted_where_the_index_tells(bags, tmp_path):
     assert f"byte {at - 8}" in " ".join(reader.damage.places) or reader.damage.places
 
 
+@pytest.mark.parametrize("form", ["ros1-none", "ros1-bz2", "ros1-lz4"])
+def test_a_recorder_that_was_killed(bags, form, tmp_path):
+    """ROS 1 writes the lengths of a chunk, and where the index is, only when it closes them."""
+    path, _ = bags[form]
+    data = bytearray(path.read_bytes())
+    last = data.rindex(b"compression=")  # its head holds the size, its length follows
+    at = data.index(b"size=", last) + 5
+    end = at + 8 + int.from_bytes(data[at + 4 : at + 8], "little")
+    data[at : at + 8] = bytes(8)
+    place = data.index(b"index_pos=") + 10
+    data[place : place + 8] = bytes(8)
+    (tmp_path / "a.bag.active").write_bytes(data[:end])
+    found, reader = read(tmp_path / "a.bag.active")
+    assert found == PAYLOADS and "no whole index" in reader.damage.places[0]
+
+
 def test_a_wrong_checksum_is_said(bags, tmp_path):
     path, _ = bags["mcap-none"]
     data = bytearray(path.read_bytes())
