@@ -140,7 +140,9 @@ function receive(answer, chosen) {
   if (data.frame !== wanted) ask();
   if (first) usual();
   follow();
-  for (const v of views) { picture(v, data.frame); for (const k of [1, 2, -1]) picture(v, data.frame + k); }
+  drop();
+  for (const v of views) picture(v, data.frame);
+  if (data.frame === wanted) for (const v of views) for (const k of [1, 2, -1]) picture(v, data.frame + k);
   refreshBar(); refreshList(); draw(); space.draw();
 }
 function stale() { asked = 0; go(wanted); }  // something changed it
@@ -155,11 +157,20 @@ function picture(v, frame) {
     return found;
   }
   const image = new Image();
+  image.frame = frame;
   image.onload = () => { image.there = true; if (data && data.frame === frame) drawView(v); };
   image.src = url;
   images.set(url, image);
   if (images.size > 12 * views.length + 12) images.delete(images.keys().next().value);
   return image;
+}
+
+function drop() {  // pictures still on their way that nobody waits for any more
+  for (const [url, image] of images) {
+    if (image.there || Math.abs(image.frame - data.frame) < 3) continue;
+    image.src = '';
+    images.delete(url);
+  }
 }
 
 // --- drawing ---

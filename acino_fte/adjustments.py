@@ -64,6 +64,7 @@ class Adjustments:
     checked: set[int] = field(default_factory=set)
     _done: list[_Step] = field(default_factory=list)
     _undone: list[_Step] = field(default_factory=list)
+    _rolling: bool = False  # the last step is turns of the wheel, and may go on
 
     def before(self, frame: int, marker: str) -> Vector | None:
         """The run's own position, m; None where it has none."""
@@ -95,7 +96,8 @@ class Adjustments:
         pins : dict, optional
             Pixels by hand, by camera, that hold from now on.
         together : bool
-            One step to undo with the change just before, when that is of the same marker and a moment ago.
+            One step to undo with the change just before, when that was a moment ago, of the same marker in
+            the same view, and to be undone together likewise (turns of a wheel).
         """
         now = datetime.now(UTC)
         frame = int(frame)
@@ -109,22 +111,21 @@ class Adjustments:
             pins=pins or {},
         )
         key = (frame, marker)
-        begun = self._before_last(key, entry) if together else None
-        if begun is not None:
-            self._done.pop()
-            self.entries[key] = entry
-            self._done.append((key, begun[0], entry))
-            self._undone.clear()
-            return entry
-        self._do(key, self.entries.get(key), entry)
+        if together and self._goes_on(key, entry):
+            begun = self._done.pop()[1]
+            self._set(key, entry)
+            self._done.append((key, begun, entry))
+        else:
+            self._do(key, self.entries.get(key), entry)
+        self._rolling = together
         return entry
 
-    def _before_last(self, key: Key, entry: Adjustment) -> tuple[Any] | None:
-        """What stood before the last change, when a new one goes on with it (in a tuple: it may be None)."""
-        what, before, after = self._done[-1] if self._done else (None, None, None)
-        if what != key or not isinstance(after, Adjustment) or after.view != entry.view:
-            return None
-        return (before,) if (entry.time - after.time).total_seconds() < _TOGETHER else None
+    def _goes_on(self, key: Key, entry: Adjustment) -> bool:
+        """Whether the last step is a turn of the wheel that this one goes on with."""
+        what, _, last = self._done[-1] if self._done else (None, None, None)
+        if not (self._rolling and what == key and isinstance(last, Adjustment) and last.view == entry.view):
+            return False
+        return (entry.time - last.time).total_seconds() < _TOGETHER
 
     def reset(self, frame: int, marker: str) -> bool:
         """Put a marker back to where the run has it; whether it was elsewhere."""
@@ -185,10 +186,12 @@ class Adjustments:
         self._set(what, after)
         self._done.append((what, before, after))
         self._undone.clear()
+        self._rolling = False
 
     def _go(self, source: list[_Step], target: list[_Step], side: int) -> int | None:
         if not source:
             return None
+        self._rolling = False
         step = source.pop()
         target.append(step)
         self._set(step[0], step[side])

@@ -83,11 +83,14 @@ def test_undo_and_redo_go_through_every_change(run):
 
 def test_turns_of_the_wheel_are_one_step(run):
     document = Adjustments(run)
+    document.change(12, "nose", np.full(3, 0.5), "cam1")  # a drag is a step of its own
     for k in range(4):
         document.change(12, "nose", np.full(3, k), "cam1", together=True)
     document.change(12, "nose", np.full(3, 9.0), "cam2", together=True)  # of another view
     assert document.undo() == 12 and document.entries[12, "nose"].after == (3.0, 3.0, 3.0)
-    assert document.undo() == 12 and not document.entries
+    assert document.undo() == 12 and document.entries[12, "nose"].after == (0.5, 0.5, 0.5)
+    document.change(12, "nose", np.full(3, 7.0), "cam1", together=True)  # after an undo it begins anew
+    assert document.undo() == 12 and document.undo() == 12 and not document.entries
 
 
 def test_magnitudes_against_closed_forms(run):
