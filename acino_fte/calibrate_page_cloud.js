@@ -5,6 +5,7 @@
 
 const CLICK = 4, REACH = 14, NEAR = 0.05; // px a click may wander; px from which a point is picked; m
 const HIDDEN = [0.1, 0.005]; // m, and share of the depth: farther behind what is drawn, a point is hidden
+const ALL_ROUND = 0.75; // length of the mean direction, below which a cloud surrounds the lidar
 const MOVING = 400000; // points drawn while the view moves
 const BACK = 0xff1c1815; // little endian: alpha, blue, green, red
 const STOPS = { // colour maps: red, green, blue
@@ -120,7 +121,20 @@ export default {
       }
       return sides.map((side) => side.sort((a, b) => a - b)[side.length >> 1] ?? (0));
     },
-    from_lidar() { this.look([0, 0, 0], false); },
+    from_lidar() { // all of it; of a lidar that sees all round, what is before it
+      let sum = [0, 0], n = 0;
+      for (let k = 0; k < (this.chosen?.length || 0); k += Math.max(1, Math.floor(this.chosen.length / 5000))) {
+        const [x, y] = this.xyz.subarray(3 * this.chosen[k], 3 * this.chosen[k] + 2), r = Math.hypot(x, y) || 1;
+        sum = [sum[0] + x / r, sum[1] + y / r];
+        n++;
+      }
+      this.look([0, 0, 0], false);
+      if (n && Math.hypot(...sum) / n < ALL_ROUND) {
+        const { width, height } = this.$refs.canvas;
+        [this.yaw, this.pitch, this.focal, this.cx, this.cy] = [0, -0.03, 0.75 * width, width / 2, height / 2];
+        this.redraw();
+      }
+    },
     from_above() {
       const [x, y, z] = this.middle(), away = Math.max(5, Math.hypot(x, y, z));
       this.yaw = Math.atan2(y, x);

@@ -256,7 +256,7 @@ export default {
         pen.strokeStyle = COLOURS[mark.chosen ? "chosen" : mark.state];
         pen.strokeRect(mx - 3, my - 3, 6, 6);
       }
-      for (const [width, ink] of [[3, "rgba(0,0,0,.5)"], [1, "#fff"]]) {
+      for (const [width, ink] of [[3, "rgba(255,255,255,.8)"], [1, "#e0002a"]]) {
         pen.strokeStyle = ink;
         pen.lineWidth = width;
         pen.beginPath();

@@ -261,7 +261,7 @@ class Tab:
         finally:
             self.save_button.props(remove="loading")
         ui.notify(
-            saved_text(written, self.work), type="positive", multi_line=True, position="top", timeout=8000
+            saved_text(written, self.work), type="positive", multi_line=True, position="bottom", timeout=8000
         )
         self.refresh_all()
         return True
