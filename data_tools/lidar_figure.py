@@ -110,16 +110,23 @@ def _groups(calibrations: Mapping[str, Calibration]) -> list[tuple[str, np.ndarr
         for group in distance_groups(each.pairs.distance[rows]):
             chosen = rows[group]
             distance = each.pairs.distance[chosen].mean()
-            out.append((f"{name} · {distance:.1f} m · {len(chosen)} pairs", each.residual[chosen]))
+            out.append(
+                (
+                    f"{name} · {distance:.1f} m · {len(chosen)} {'pair' if len(chosen) == 1 else 'pairs'}",
+                    each.residual[chosen],
+                )
+            )
     return out
 
 
 def _histogram(axes: Axes, values: np.ndarray, span: tuple[float, float], colour: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     n_bins = int(np.clip(2 * np.sqrt(len(values)), 8, 40))
     counts, edges = np.histogram(values, bins=n_bins, range=span)
     axes.stairs(counts, edges, fill=True, color=colour, alpha=0.8)
     axes.set(xlim=span, ylim=(0, 1.55 * max(1, counts.max())))
-    axes.yaxis.get_major_locator().set_params(integer=True)
+    axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     rms = np.sqrt(np.mean(values**2))
     text = f"mean {values.mean():+.2f}, SD {values.std():.2f}, RMSE {rms:.2f} px".replace("-", "−")
     axes.text(0.985, 0.97, text, transform=axes.transAxes, ha="right", va="top", fontsize=7)
@@ -170,7 +177,15 @@ def depth_figure(
     size = float(np.clip(4e4 / max(len(seen), 1), 0.6, 12.0))
     low, high = np.percentile(depth[seen], (2, 98)) if len(seen) else (0.0, 1.0)
     dots = axes.scatter(
-        *pixel[seen].T, c=depth[seen], s=size, lw=0, cmap=_DEPTH_MAP, vmin=low, vmax=high, rasterized=True
+        pixel[seen, 0],
+        pixel[seen, 1],
+        c=depth[seen],
+        s=size,
+        lw=0,
+        cmap=_DEPTH_MAP,
+        vmin=low,
+        vmax=high,
+        rasterized=True,
     )
     figure.colorbar(dots, ax=axes, fraction=0.03, pad=0.01, label="Depth (m)")
     return figure

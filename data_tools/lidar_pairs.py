@@ -249,7 +249,9 @@ def _json_rows(text: str, path: Path) -> list[tuple[int, dict[str, Any]]]:
     try:
         data = json.loads(text)
     except ValueError as error:
-        raise InputError("The file of pairs is no whole JSON.", file=path, found=str(error)) from None
+        raise InputError(
+            "The file of pairs is no whole JSON.", file=path, found=str(error), remedy=_REMEDY
+        ) from None
     if not isinstance(data, dict) or data.get("format") != FORMAT or not isinstance(data.get("pairs"), list):
         raise InputError(
             "This JSON holds no pairs of picks.",

@@ -156,7 +156,7 @@ def solve_lidar_camera(
         Too few pairs, all on one line, an unknown name in `fit`, or nothing fits.
     """
     noise = noise or PickNoise()
-    begin = _first_camera(resolution, camera, name, focal_px)
+    begin = first_camera(resolution, camera, name, focal_px)
     free = _free(fit, camera, focal_px)
     used = np.flatnonzero(pairs.used_mask)
     pixel, xyz = pairs.pixel[used], pairs.xyz[used]
@@ -165,7 +165,7 @@ def solve_lidar_camera(
     rigs = (rig_m,) if rig_m else (RIG, ANYWHERE)
     guesses = starts(begin, "f" in free, pixel, xyz)
     fits = [
-        _best_fit(guesses, names, pixel, xyz, noise, _priors(begin, camera, names, focal_px, rig))
+        _best_fit(guesses, names, pixel, xyz, noise, known_before(begin, camera, focal_px, rig))
         for rig in rigs
     ]
     best = min(fits, key=_evidence)
@@ -174,7 +174,7 @@ def solve_lidar_camera(
     return _calibration(pairs, used, best, pixel, xyz, noise)
 
 
-def _first_camera(
+def first_camera(
     resolution: tuple[int, int], camera: Camera | None, name: str, focal: float | tuple[float, float] | None
 ) -> Camera:
     """The lens to begin with: the given one, or one with the principal point in the middle."""
@@ -259,14 +259,13 @@ def _check_enough(pixel: np.ndarray, xyz: np.ndarray, n_parameters: int, camera:
         )
 
 
-def _priors(
+def known_before(
     begin: Camera,
     camera: Camera | None,
-    names: tuple[str, ...],
     focal: float | tuple[float, float] | None,
     rig: float,
 ) -> Priors:
-    """What is known before the pairs."""
+    """What is known before the pairs: roughly where the camera is, and what was told of its lens."""
     width, height = begin.resolution
     value = {"cx": begin.matrix[0, 2], "cy": begin.matrix[1, 2]}
     sd = dict.fromkeys(POSE[3:], rig) | {"cx": _CENTRE * width, "cy": _CENTRE * width} | _LENS
@@ -334,7 +333,7 @@ def _calibration(
         datetime.now(UTC).isoformat(timespec="seconds"),
     )
     fitted = tuple(key for key, parts in FIT.items() if any(p in fit.names for p in parts))
-    messages = advice(fit, ambiguity, xyz, noise)
+    messages = advice(fit, ambiguity, xyz, noise, used)
     return Calibration(
         saved, pairs, residual, left, outlier, fit.scale, bound, fitted, ambiguity.determined, messages,
         fit.converged,

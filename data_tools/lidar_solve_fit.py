@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -124,13 +125,11 @@ def robust_fit(
     scale = median_scale(fit.squared, len(names))
     for _ in range(4 if rough else 12):
         steps, near = (10, _ROUGH) if rough else (60, _NEAR)
-        fit = _descend(
-            fit, problem, lambda d2, s=scale: 1.0 / (1.0 + d2 / (CAUCHY * s) ** 2), scale, steps, near
-        )
+        fit = _descend(fit, problem, partial(_cauchy, scale=scale), scale, steps, near)
         last, scale = scale, median_scale(fit.squared, len(names))
         if abs(scale - last) < 0.03 * last:
             break
-    return replace(fit, weight=1.0 / (1.0 + fit.squared / (CAUCHY * scale) ** 2), scale=scale)
+    return replace(fit, weight=_cauchy(fit.squared, scale), scale=scale)
 
 
 def polished(
@@ -149,11 +148,18 @@ def polished(
     problem = (names, pixel, xyz, noise, priors)
     fit = at(camera, *problem)
     for _ in range(20):
-        fit = _descend(fit, problem, lambda d2, s=scale: _biweight(d2, s, len(names)), scale, 60, _NEAR)
+        fit = _descend(
+            fit, problem, partial(_biweight, scale=scale, n_parameters=len(names)), scale, 60, _NEAR
+        )
         last, scale = scale, final_scale(fit.squared, fit.weight > 0, len(names))
         if abs(scale - last) < 0.003 * last:
             break
     return replace(fit, weight=_biweight(fit.squared, scale, len(names)), scale=scale)
+
+
+def _cauchy(squared: np.ndarray, scale: float) -> np.ndarray:
+    """Weights (P,): 1 / (1 + d²/c²)."""
+    return 1.0 / (1.0 + squared / (CAUCHY * scale) ** 2)
 
 
 def _biweight(squared: np.ndarray, scale: float, n_parameters: int) -> np.ndarray:

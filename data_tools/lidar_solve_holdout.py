@@ -41,19 +41,25 @@ def choose_lens(fit: Fit, pixel: np.ndarray, xyz: np.ndarray, noise: PickNoise) 
     A lens with more parameters is taken where it foresees left-out pairs better by two standard errors, and
     by more than a simpler one does.
     """
-    best, gain = fit, 0.0
-    for more in LENSES:
-        names = fit.names + more
-        if len(names) > len(pixel):  # fewer than two numbers a parameter
-            continue
-        trial = polished(fit.camera, names, pixel, xyz, noise, fit.priors, fit.scale)
-        limit = OUTLIER * fit.scale**2
-        better = np.minimum(left_out_squared(fit), limit) - np.minimum(left_out_squared(trial), limit)
-        better /= fit.scale**2
-        sure = better.sum() - _SURE * np.sqrt(len(better)) * better.std(ddof=1)
-        if sure > 0 and better.sum() > gain + 2.0 * (len(names) - len(best.names)):
-            best, gain = trial, better.sum()
-    return best
+    base = fit.names
+    while True:
+        best, gain = fit, 0.0
+        for more in LENSES:
+            names = base + more
+            if not set(names) > set(fit.names) or len(names) > len(
+                pixel
+            ):  # two numbers a parameter, at least
+                continue
+            trial = polished(fit.camera, names, pixel, xyz, noise, fit.priors, fit.scale)
+            limit = OUTLIER * fit.scale**2
+            better = np.minimum(left_out_squared(fit), limit) - np.minimum(left_out_squared(trial), limit)
+            better /= fit.scale**2
+            sure = better.sum() - _SURE * np.sqrt(len(better)) * better.std(ddof=1)
+            if sure > 0 and better.sum() > gain + 2.0 * (len(names) - len(best.names)):
+                best, gain = trial, better.sum()
+        if best is fit:
+            return fit
+        fit = best
 
 
 def expected_rmse(fit: Fit, xyz: np.ndarray, noise: PickNoise) -> tuple[float, float]:

@@ -102,9 +102,8 @@ def _places(
     """Places (n, 3) in the lidar's frame that the camera sees, and their placement (n,)."""
     n_boards = {"board": 1, "boards": 4}.get(targets, 0)
     if not n_boards:
-        return _in_view(camera, distance * rng.uniform(1 - _DEPTH, 1 + _DEPTH, n), 0.95, rng), np.zeros(
-            n, int
-        )
+        depth = distance * rng.uniform(1 - _DEPTH, 1 + _DEPTH, n)
+        return _in_view(camera, depth, 0.95, _even(n, n_spread, rng)), np.zeros(n, int)
     reach = 0.1 if n_boards == 1 else 0.6
     middles = _in_view(camera, distance * rng.uniform(0.95, 1.05, n_boards), reach, rng.random((n_boards, 2)))
     xyz, placement = np.empty((n, 3)), np.arange(n) % n_boards

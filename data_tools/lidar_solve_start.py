@@ -16,7 +16,7 @@ import numpy as np
 from acino_fte.cameras import Camera
 
 N_FOCALS, _NARROWEST, _WIDEST = 14, 40.0, 0.25  # focal lengths to try, in widths of the image
-_HANDFULS, _PNP_HANDFULS, _KEPT = 160, 14, 3
+_HANDFULS, _PNP_HANDFULS, _KEPT = 80, 10, 3
 
 
 def starts(camera: Camera, free_focal: bool, pixel: np.ndarray, xyz: np.ndarray) -> list[Camera]:
