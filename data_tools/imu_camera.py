@@ -12,7 +12,7 @@ from acino_fte.data_tools.rotations import cross_matrix, rotation_vector
 from acino_fte.errors import InputError
 
 _LEAST = 6  # pairs of frames
-_STRIDE = 0.1  # s between the two frames of a pair
+_STRIDE = 0.3  # s between the two frames of a pair
 _UNSURE = np.radians(5.0)
 
 
@@ -174,7 +174,8 @@ def find_mounting(
     used = weight > 0
     variance = float((weight[:, None] * left**2).sum() / max(3 * weight.sum() - 4, 1.0))
     information = np.einsum("k,kij,kil->jl", weight, jacobian, jacobian)
-    covariance = stride * variance * np.linalg.pinv(information, rcond=1e-12)
+    shared = stride if motion.numbers.get("model") == "full" else 2  # errors of chained turns add up
+    covariance = shared * variance * np.linalg.pinv(information, rcond=1e-12)
     worst = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     if worst > _UNSURE or np.linalg.eigvalsh(information[:3, :3])[0] < 1e-9:
         raise InputError(

@@ -99,8 +99,9 @@ def turn_between(a: np.ndarray, b: np.ndarray, threshold: float) -> TwoView | No
 def step_between(a: np.ndarray, b: np.ndarray, threshold: float) -> TwoView | None:
     """A turn and the direction of a step, by the essential matrix [t]× R.
 
-    MAGSAC++ (Barath et al. 2020, OpenCV) samples it; Sampson's distance (Hartley and Zisserman 2004, eq.
-    11.9) is then least over the five parameters with Cauchy's loss.
+    RANSAC, RANSAC with local optimisation and MAGSAC++ (Barath et al. 2020), all of OpenCV, sample it, since
+    each alone now and then ends in a wrong motion. Sampson's distance (Hartley and Zisserman 2004, eq. 11.9) is
+    then least over the five parameters with Cauchy's loss, and the best of the three is kept.
 
     Parameters
     ----------
@@ -109,9 +110,22 @@ def step_between(a: np.ndarray, b: np.ndarray, threshold: float) -> TwoView | No
     """
     if len(a) < LEAST_POINTS:
         return None
-    start = _sampled_step(a, b, threshold)
-    if start is None:
+    starts = [
+        start
+        for way in ("USAC_ACCURATE", "USAC_MAGSAC", "RANSAC")
+        if (start := _sampled_step(a, b, threshold, way))
+    ]
+    found = [view for start in starts if (view := _refined_step(a, b, start)) is not None]
+    if not found:
         return None
+    least = min(view.noise for view in found)
+    return min(found, key=lambda v: float(np.log1p((v.residual * v.noise / least / _CAUCHY) ** 2).sum()))
+
+
+def _refined_step(
+    a: np.ndarray, b: np.ndarray, start: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> TwoView | None:
+    """The best turn and step near a start: a turn, a direction, and the inliers (K,) of the two."""
     turn, way, near = start
     across = np.linalg.svd(way[None])[2][1:]  # two directions across t
     u, v = _rays(a), _rays(b)
@@ -120,18 +134,16 @@ def step_between(a: np.ndarray, b: np.ndarray, threshold: float) -> TwoView | No
         direction = rotation_matrix(np.cross(way, change[3:] @ across)) @ way
         return rotation_matrix(change[:3]) @ turn, direction
 
-    def distance(rotation: np.ndarray, direction: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
-        return sampson(u[rows], v[rows], rotation, direction)
-
-    change, information, scale = _refined(lambda c: distance(*model(c), near)[:, None], 5)
-    rotation, direction = model(change)
-    left = np.abs(distance(rotation, direction, slice(None)))
-    inliers = (left < _OUTLIER * scale) & in_front(u, v, rotation, direction)
-    if inliers.sum() < LEAST_POINTS:
-        return None
+    for _ in range(2):  # once with the sampled inliers, once with those of the refined model
+        change, information, scale = _refined(lambda c, m=near: sampson(u[m], v[m], *model(c))[:, None], 5)
+        rotation, direction = model(change)
+        left = np.abs(sampson(u, v, rotation, direction))
+        near = (left < _OUTLIER * scale) & in_front(u, v, rotation, direction)
+        if near.sum() < LEAST_POINTS:
+            return None
     covariance = scale**2 * np.linalg.pinv(information)
     spread = float(np.sqrt(0.5 * np.trace(covariance[3:, 3:])))
-    return TwoView(rotation, direction, covariance[:3, :3], spread, inliers, scale, left / scale)
+    return TwoView(rotation, direction, covariance[:3, :3], spread, near, scale, left / scale)
 
 
 def sampson(u: np.ndarray, v: np.ndarray, rotation: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -184,12 +196,12 @@ def _frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _sampled_step(
-    a: np.ndarray, b: np.ndarray, threshold: float
+    a: np.ndarray, b: np.ndarray, threshold: float, way: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     cv2 = imported_cv2()
     try:
         essential, mask = cv2.findEssentialMat(
-            a, b, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.9999, threshold=threshold
+            a, b, np.eye(3), method=getattr(cv2, way), prob=0.9999, threshold=threshold
         )
     except cv2.error:
         return None
@@ -198,10 +210,10 @@ def _sampled_step(
     near = mask.ravel() > 0
     if near.sum() < LEAST_POINTS:
         return None
-    _, rotation, way, _ = cv2.recoverPose(essential, a[near], b[near], np.eye(3))
-    if not (np.isfinite(rotation).all() and np.isfinite(way).all()):
+    _, rotation, step, _ = cv2.recoverPose(essential, a[near], b[near], np.eye(3))
+    if not (np.isfinite(rotation).all() and np.isfinite(step).all()):
         return None
-    return rotation, way.ravel() / np.linalg.norm(way), near
+    return rotation, step.ravel() / np.linalg.norm(step), near
 
 
 def _refined(residual: Callable[[np.ndarray], np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray, float]:
