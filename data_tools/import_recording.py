@@ -25,7 +25,7 @@ from acino_fte.data_tools.import_scan import Scan, StreamScan, scan_recording
 from acino_fte.data_tools.import_sync import Inputs, PivotHint, Timing, per_sample, synchronise
 from acino_fte.data_tools.recording import ImuSamples
 from acino_fte.data_tools.sync import Synchronisation
-from acino_fte.errors import InputError
+from acino_fte.errors import InputError, did_you_mean
 from acino_fte.metrics import json_safe
 from acino_fte.result_files import Contents, check_output_folder, written_whole
 
@@ -157,6 +157,7 @@ def import_recording(
     calibration = read_lidar_camera(options.calibration)
     contents = import_contents(calibration.name)
     folder = _target(Path(out), recording, contents, overwrite)
+    species = _species_file(options.species)
     keypoints = _keypoints(options.keypoints)
     with ExitStack() as stack:
         if options.video is not None:
@@ -170,7 +171,7 @@ def import_recording(
         inputs = replace(inputs, imu_to_camera=calibration.camera.rotation)
         tell("synchronising")
         timing = synchronise(inputs)
-        work = _Work(scan, inputs, timing, options, calibration, keypoints, tell)
+        work = _Work(scan, inputs, timing, options, calibration, keypoints, species, tell)
         with written_whole(folder, contents) as working:
             provenance, warnings = work.write(working, folder.name, command)
     return Import(folder, provenance, warnings)
@@ -204,24 +205,15 @@ def _inputs(scan: Scan, video: VideoPictures | None, keypoints: Any, options: Im
     if lidar is None:
         raise InputError("There is no lidar in the recording.", file=scan.path)
     imu = scan.choose("imu", options.imu_topic)
+    _check_camera(scan, options.camera_topic)
     image = scan.choose("image", options.camera_topic)
     info = scan.choose("image_info", options.camera_topic)
     unread = _unread_images(scan, options.camera_topic)
-    camera = info or image
-    if options.camera_topic is not None and camera is None and unread is None:
-        known = [s.name for s in scan.streams.values() if s.kind in ("image", "image_info")]
-        raise InputError(
-            "The recording has no such camera.",
-            file=scan.path,
-            key="--camera-topic",
-            expected=", ".join(known) or "no camera at all",
-            found=options.camera_topic,
-        )
+    camera = info if info is not None else image
     pictures: Pictures | None = video
-    if pictures is None and (image or unread):
-        stream = image or unread
-        if stream is not None:
-            pictures = MessagePictures(scan.path, stream.name, len(stream) or stream.n_values)
+    shown = image if image is not None else unread
+    if pictures is None and shown is not None:
+        pictures = MessagePictures(scan.path, shown.name, len(shown) or shown.n_values)
     n_frames = (
         len(pictures)
         if pictures is not None
@@ -234,11 +226,28 @@ def _inputs(scan: Scan, video: VideoPictures | None, keypoints: Any, options: Im
     )  # fmt: skip
 
 
+def _check_camera(scan: Scan, topic: str | None) -> None:
+    known = [s.name for s in scan.streams.values() if s.kind in ("image", "image_info")]
+    if topic is not None and topic not in known:
+        raise InputError(
+            f"The recording has no such camera{did_you_mean(topic, known)}",
+            file=scan.path,
+            key="--camera-topic",
+            expected=", ".join(known) or "no camera at all",
+            found=topic,
+            remedy="see what it holds with --inspect",
+        )
+
+
 def _unread_images(scan: Scan, topic: str | None) -> StreamScan | None:
     """The stream of images that was not decoded, because the driver describes them elsewhere."""
     found = [s for s in scan.streams.values() if s.kind == "image" and not len(s) and s.n_values]
-    named = [s for s in found if topic is None or s.name == topic]
-    return named[0] if len(named) == 1 else found[0] if len(found) == 1 else None
+    if topic is not None:
+        side = topic.rpartition("/")[0]
+        found = [s for s in found if s.name == topic] or [
+            s for s in found if s.name.rpartition("/")[0] == side
+        ]
+    return found[0] if len(found) == 1 else None
 
 
 def _check_frames(
@@ -286,6 +295,7 @@ class _Work:
     options: ImportOptions
     calibration: Any
     keypoints: Any
+    species: Path | None
     tell: Callable[[str], None]
 
     def write(self, folder: Path, name: str, command: str) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -380,10 +390,12 @@ class _Work:
     def _sequence(self, folder: Path, name: str, sync: Synchronisation, camera: str) -> None:
         from acino_fte.data_tools.sequence_file import write_sequence_file
 
+        if self.species is not None:
+            shutil.copyfile(self.species, folder / "species.yaml")
         content: dict[str, Any] = {
             "format": "acino-fte/sequence/1",
             "name": name,
-            "species": _species(self.options.species, folder),
+            "species": self.options.species if self.species is None else "species.yaml",
             "fps": round(sync.fps, 6),
             "cameras": "cameras.json",
             "keypoints": {camera: f"dlc/{camera}.csv"},
@@ -398,15 +410,12 @@ class _Work:
         write_sequence_file(folder / "sequence.yaml", content)
 
 
-def _species(name: str | None, folder: Path) -> str | None:
-    """The species as the sequence file names it; a user's own file is copied into the folder."""
+def _species_file(name: str | None) -> Path | None:
+    """The file of a user's own species; None for a bundled one, or without any."""
     from acino_fte.models import species_names
     from acino_fte.skeleton import species_file_path
 
-    if name is None or name in species_names():
-        return name
-    shutil.copyfile(species_file_path(name), folder / "species.yaml")
-    return "species.yaml"
+    return None if name is None or name in species_names() else species_file_path(name)
 
 
 def _write_imu(path: Path, imu: ImuSamples) -> None:

@@ -154,8 +154,9 @@ class Scan:
             for stream in found:
                 if stream.name == name:
                     return stream
-            if kind in ("image", "image_info"):
-                return None  # one topic names either
+            if kind in ("image", "image_info"):  # one topic names both, which lie side by side
+                beside = [one for one in found if one.name.rpartition("/")[0] == name.rpartition("/")[0]]
+                return beside[0] if len(beside) == 1 else None
             names = [stream.name for stream in found]
             raise InputError(
                 f"The recording has no such {_NAMES[kind]}{did_you_mean(name, names)}",

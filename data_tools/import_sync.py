@@ -23,7 +23,7 @@ _LONGEST_LATENCY = 0.15  # s
 _SEARCHED_S = 10.0  # of the inertial sensor about the frames, that a match must stand out in
 _MOTION_S = 40.0  # of video in which motion is measured
 _LEAST_MOTION_S = 1.5
-_EVEN = 0.02
+_EVEN = 0.25  # of a period: stamps whose steps vary less are those of a video that counts its frames
 _PIVOT = "FRAME=SECONDS, led:X,Y,W,H=SECONDS or knock"
 
 
@@ -305,7 +305,7 @@ def _own_grid(inputs: Inputs, own: Stamps | None) -> tuple[FrameGrid | None, flo
         stamps = inputs.pictures.stamps_ns
     if stamps is not None and len(stamps) == inputs.n_frames and inputs.n_frames > 2:
         steps = np.diff(stamps) / max(float(np.median(np.diff(stamps))), 1.0)
-        if np.ptp(steps) > _EVEN or number is not None:
+        if np.abs(steps - 1).max() > _EVEN or number is not None:
             grid = frame_grid(stamps, number, inputs.fps)
             return grid, inputs.fps or 1 / grid.period
     fps = inputs.fps or (inputs.pictures.fps if inputs.pictures is not None else None)

@@ -8,7 +8,7 @@ import numpy as np
 
 from acino_fte.data_tools.sync import Stamps, even_losses
 
-_EVEN = 0.02  # of a period: a video whose stamps vary less was stamped by counting
+_EVEN = 0.25  # of a period: a video whose steps vary less was stamped by counting (Matroska has whole ms)
 _MISS = 0.35  # of a period, at most, between a frame of the video and its message
 _CLEAR = 3.0
 
@@ -62,7 +62,7 @@ def _by_times(video_ns: np.ndarray, camera: Stamps) -> np.ndarray | None:
     times = (camera.device_ns - camera.device_ns[0]).astype(float) * 1e-9
     period = float(np.median(np.diff(times)))
     steps = np.diff(video) / max(float(np.median(np.diff(video))), 1e-9)
-    if np.ptp(steps) < _EVEN or period <= 0:
+    if np.abs(steps - 1).max() < _EVEN or period <= 0:
         return None
     found = []
     for start in range(len(times) - len(video) + 1):
