@@ -70,11 +70,11 @@ class StampLog:
         n_before = 0 if self._last is None else 1
         if self._last is not None:
             stamps, samples = np.r_[self._last[0], stamps], np.r_[self._last[1], samples]
-        self.held = not final and len(stamps) > 1 and abs(int(stamps[-1]) - int(stamps[-2])) > _OUTLIER_NS
-        if self.held:
-            stamps, samples = stamps[:-1], samples[:-1]
         keep = _no_outliers(stamps)
         self.n_outliers += int((~keep).sum())
+        around = stamps[keep][-2:]
+        self.held = not final and len(around) > 1 and abs(int(around[1]) - int(around[0])) > _OUTLIER_NS
+        keep[len(keep) - self.held :] = False
         stamps, samples = stamps[keep], samples[keep]
         if self.first_ns is None and len(stamps):
             self.first_ns = int(stamps[0])
@@ -82,7 +82,7 @@ class StampLog:
         self._count(stamps, samples)
         if len(stamps):
             self._last = int(stamps[-1]), int(samples[-1])
-        return np.r_[keep[n_before:], [False] * self.held].astype(bool)
+        return keep[n_before:]
 
     def _learn(self, stamps: np.ndarray, samples: np.ndarray) -> None:
         """Estimate the step where the type of the device does not tell it, or tells it wrong.
