@@ -19,12 +19,10 @@ from acino_fte.cameras import Camera, CameraArray
 from acino_fte.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from acino_fte.skeleton import Skeleton
 
 DATA, METRICS, SEQUENCE = "fte.nc", "metrics.json", "sequence.yaml"
-_NEEDED = ("position", "detection", "residual")
+_NEEDED = ("position", "detection", "residual", "frame", "keypoints", "camera")
 _AGREE_PX = 0.5
 _AGAIN = "run the trajectory estimation to its end (acino-fte run SEQUENCE -o FOLDER)"
 
@@ -197,29 +195,24 @@ def open_run(folder: Path | str) -> Run:
     _check_folder(folder)
     metrics = _metrics(folder / METRICS)
     identity = sha256((folder / DATA).read_bytes()).hexdigest()
-    dataset = _dataset(folder / DATA)
-    position = dataset["position"].isel(individuals=0).transpose("time", "keypoints", "space")
+    data = _Data.read(folder / DATA)
     pixels = ("time", "camera", "keypoints", "pixel")
     return Run(
         folder=folder,
         name=folder.resolve().name,
         identity=identity,
         metrics=metrics,
-        fps=float(dataset.attrs["fps"]),
-        frames=np.asarray(dataset["frame"].values),
-        markers=[str(name) for name in dataset["keypoints"].values],
-        camera_names=[str(name) for name in dataset["camera"].values],
-        positions=np.asarray(position.values, dtype=float),
-        detection=np.asarray(dataset["detection"].transpose(*pixels).values, dtype=float),
-        residual=np.asarray(dataset["residual"].transpose(*pixels).values, dtype=float),
-        depth_residual=_depth(dataset),
+        fps=data.fps,
+        frames=data.ordered("frame", ("time",)).astype(int),
+        markers=data.names("keypoints"),
+        camera_names=data.names("camera"),
+        positions=data.ordered("position", ("individuals", "time", "keypoints", "space"))[0],
+        detection=data.ordered("detection", pixels),
+        residual=data.ordered("residual", pixels),
+        depth_residual=data.ordered("depth_residual", ("time", "keypoints"))
+        if "depth_residual" in data.variables
+        else None,
     )
-
-
-def _depth(dataset: xr.Dataset) -> np.ndarray | None:
-    if "depth_residual" not in dataset:
-        return None
-    return np.asarray(dataset["depth_residual"].transpose("time", "keypoints").values, dtype=float)
 
 
 def _check_folder(folder: Path) -> None:
@@ -268,30 +261,58 @@ def _metrics(path: Path) -> dict[str, Any]:
     return metrics
 
 
-def _dataset(path: Path) -> xr.Dataset:
-    import xarray as xr
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """Variables of a netCDF file, with their dimensions; read without xarray, whose import takes a second."""
 
-    try:
-        with xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as file:
-            dataset = file.load()
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise InputError(
-            "The trajectory of the run cannot be read.",
-            file=path,
-            expected="netCDF as a run writes it",
-            found=str(error).splitlines()[0][:120] if str(error) else type(error).__name__,
-            remedy=_AGAIN,
-        ) from None
-    lacking = [name for name in (*_NEEDED, "frame", "keypoints", "camera") if name not in dataset.variables]
-    if lacking or "fps" not in dataset.attrs:
-        raise InputError(
-            "The file is no trajectory of this program.",
-            file=path,
-            expected=f"the variables {', '.join(_NEEDED)} and the attribute fps",
-            found=f"none called {', '.join(lacking)}" if lacking else "no attribute fps",
-            remedy=_AGAIN,
-        )
-    return dataset
+    path: Path
+    variables: dict[str, tuple[tuple[str, ...], np.ndarray]]
+    fps: float
+
+    @classmethod
+    def read(cls, path: Path) -> _Data:
+        import h5netcdf
+
+        try:
+            with h5netcdf.File(path, "r", decode_vlen_strings=True) as file:
+                variables = {name: (tuple(v.dimensions), v[...]) for name, v in file.variables.items()}
+                fps = float(file.attrs.get("fps", np.nan))
+        except (OSError, ValueError, KeyError, RuntimeError, TypeError) as error:
+            raise InputError(
+                "The trajectory of the run cannot be read.",
+                file=path,
+                expected="netCDF as a run writes it",
+                found=str(error).splitlines()[0][:120] if str(error) else type(error).__name__,
+                remedy=_AGAIN,
+            ) from None
+        lacking = [name for name in _NEEDED if name not in variables]
+        if lacking or not fps > 0:
+            raise InputError(
+                "The file is no trajectory of this program.",
+                file=path,
+                expected=f"the variables {', '.join(_NEEDED)} and the attribute fps",
+                found=f"none called {', '.join(lacking)}" if lacking else "no attribute fps",
+                remedy=_AGAIN,
+            )
+        return cls(path, variables, fps)
+
+    def names(self, name: str) -> list[str]:
+        """Labels of a dimension."""
+        return [v.decode() if isinstance(v, bytes) else str(v) for v in self.variables[name][1]]
+
+    def ordered(self, name: str, dims: tuple[str, ...]) -> np.ndarray:
+        """Values with their dimensions in an order."""
+        have, values = self.variables[name]
+        if set(have) != set(dims):
+            raise InputError(
+                "The trajectory of the run has another form than this version reads.",
+                file=self.path,
+                key=name,
+                expected=f"dimensions {', '.join(dims)}",
+                found=", ".join(have),
+                remedy=_AGAIN,
+            )
+        return np.asarray(values, dtype=float).transpose([have.index(dim) for dim in dims])
 
 
 def open_runs(folders: Sequence[Path]) -> list[Run]:
