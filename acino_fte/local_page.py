@@ -208,16 +208,43 @@ def _server(
 ) -> tuple[Guard, Any]:
     """The guarded application and its server."""
     try:
+        import nicegui  # noqa: F401
         import uvicorn
-        from fastapi import FastAPI, HTTPException, Response
-        from nicegui import app as pages
-        from nicegui import ui
     except ImportError as error:
         raise InputError(
             "The page needs NiceGUI.", expected="the extra 'lidar'", found=str(error), remedy=REMEDY
         ) from error
     if not _served.acquire(blocking=False):
         raise RuntimeError("a process serves one page: NiceGUI keeps one application")
+
+    class Server(uvicorn.Server):
+        ready: Callable[[], None] = staticmethod(lambda: None)
+
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets)
+            if self.started:
+                self.ready()
+
+    session.url = f"http://{HOST}:{port}/"
+    guard = Guard(_application(session, build), port)
+    if close_with_browser:
+        _follow_browser(session)
+    config = uvicorn.Config(
+        guard,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        timeout_graceful_shutdown=1,
+    )
+    return guard, Server(config)
+
+
+def _application(session: PageSession, build: Callable[[PageSession], object]) -> Any:
+    """NiceGUI's application, with the shared files beside it."""
+    from fastapi import FastAPI, HTTPException, Response
+    from nicegui import app as pages
+    from nicegui import ui
 
     outer = FastAPI(openapi_url=None)
 
@@ -236,28 +263,7 @@ def _server(
         show_welcome_message=False,
     )
     pages.on_exception(_show_unexpected)
-    if close_with_browser:
-        _follow_browser(session)
-
-    class Server(uvicorn.Server):
-        ready: Callable[[], None] = staticmethod(lambda: None)
-
-        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-            await super().startup(sockets)
-            if self.started:
-                self.ready()
-
-    session.url = f"http://{HOST}:{port}/"
-    guard = Guard(outer, port)
-    config = uvicorn.Config(
-        guard,
-        log_level="error",
-        access_log=False,
-        server_header=False,
-        proxy_headers=False,
-        timeout_graceful_shutdown=1,
-    )
-    return guard, Server(config)
+    return outer
 
 
 def _build(session: PageSession, build: Callable[[PageSession], object]) -> None:
