@@ -8,6 +8,8 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from acino_fte.data_tools.bags_ecal import MAGIC as HDF5_MAGIC
 from acino_fte.data_tools.bags_ecal import EcalWalk
 from acino_fte.data_tools.bags_mcap import MAGIC as MCAP_MAGIC
@@ -202,7 +204,8 @@ class BagReader:
             types = definitions(channel.type, channel.definition, channel.version, channel.encoding)
             fields = decode(message.data, channel.type, types, channel.layout)
             unit = self._unit(channel.topic, fields) if kind == "imu" else 1.0
-            value = from_message(channel.type, fields, unit)
+            with np.errstate(all="ignore"):  # damaged numbers
+                value = from_message(channel.type, fields, unit)
         except (DecodeError, ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
             n, why = self._undecoded.get(channel.topic, (0, str(error)))
             self._undecoded[channel.topic] = (n + 1, why)

@@ -78,7 +78,7 @@ class SqliteWalk:
 
     def _topic(self, number: int, strings: Any, texts: dict[str, Any]) -> None:
         """A row of the table of topics: name, type, serialisation."""
-        name, kind, form = strings
+        name, kind, form = (value if isinstance(value, str) else "" for value in strings)
         encoding, definition = texts.get(kind, ("", ""))
         encoding = "ros2idl" if encoding == "ros2idl" else "ros2msg"
         channel = Channel(name, type_name(kind), definition or "", encoding, LAYOUTS.get(form), 2)

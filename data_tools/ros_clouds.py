@@ -119,7 +119,7 @@ def _scaled(values: np.ndarray, unit: float) -> np.ndarray:
     """Whole nanoseconds of times in a unit; seconds and their fraction apart, to keep every digit."""
     if np.issubdtype(values.dtype, np.integer):
         return values.astype(np.int64) * int(unit)
-    values = np.nan_to_num(values.astype(float))
+    values = np.nan_to_num(values.astype(float), posinf=0.0, neginf=0.0)
     whole = np.floor(values)
     return whole.astype(np.int64) * int(unit) + np.rint((values - whole) * unit).astype(np.int64)
 
