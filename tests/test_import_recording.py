@@ -30,7 +30,7 @@ from acino_fte.data_tools.sequence_file import read_sequence_file
 from acino_fte.data_tools.video import write_video
 from acino_fte.errors import InputError
 
-FPS, N = 60.0, 150
+FPS, N = 60.0, 120
 FOCAL = 400.0
 UNIX = 1_750_000_000_000_000_000
 CAMERA_NS, LIDAR_NS = 40_000_000_000, 910_000_000_000  # what the sensors' clocks show at time 0
@@ -378,10 +378,10 @@ def test_a_cut_recording_is_imported_as_far_as_it_goes(rig, tmp_path):
         ({"calibration": "nothing.json"}, ("nothing.json",)),
         ({"keypoints": "nothing.csv"}, ("nothing.csv",)),
         ({"video": "nothing.mp4"}, ("nothing.mp4",)),
-        ({"frames": "100:9000"}, ("--frames", "146")),
+        ({"frames": "100:9000"}, ("--frames", "116")),
         ({"frames": "ten"}, ("--frames", "80:190")),
         ({"pivot": "soon"}, ("--pivot", "FRAME=SECONDS")),
-        ({"pivot": "9999=1.0"}, ("--pivot", "0 to 145")),
+        ({"pivot": "9999=1.0"}, ("--pivot", "0 to 115")),
         ({"fps": "-3"}, ("--fps",)),
         ({"lidar-topic": "/livox/ladar"}, ("--lidar-topic", "did you mean '/livox/lidar'")),
         ({"camera-topic": "/webcam"}, ("--camera-topic",)),
