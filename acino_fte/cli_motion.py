@@ -266,7 +266,7 @@ def _from_video(
     if len(pictures) > len(boxes):
         boxes = np.concatenate([boxes, np.repeat(boxes[-1:], len(pictures) - len(boxes), axis=0)])
     boxes = boxes[: len(pictures)]
-    return visual_odometry(pictures, sequence.cameras[name], model=model, boxes=boxes, tell=tell)  # type: ignore[arg-type]
+    return visual_odometry(pictures, sequence.cameras[name], model=model, boxes=boxes, tell=tell)
 
 
 def _from_encoders(sequence: Sequence, file: Path, head: tuple[Any, ...], start: float) -> CameraMotion:
@@ -303,10 +303,10 @@ def _from_imu(
     frames = np.arange(sequence.n_frames) / sequence.fps
     stamps = samples.time_ns[0] + np.round((frames + start) * 1e9).astype(np.int64)
     tell("integrating")
-    attitude = gravity_attitude(samples, method=method)  # type: ignore[arg-type]
+    attitude = gravity_attitude(samples, method=method)
     mounting = _mounting(sequence, name, attitude, stamps, mount, tell)
     forward = mounting.imu_to_camera.T @ [0.0, 0.0, 1.0]
-    attitude = gravity_attitude(samples, method=method, forward=forward)  # type: ignore[arg-type]
+    attitude = gravity_attitude(samples, method=method, forward=forward)
     return motion_from_attitude(attitude, stamps, mounting)
 
 

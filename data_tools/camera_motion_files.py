@@ -109,7 +109,8 @@ def motion_figure(motion: CameraMotion, name: str, fps: float) -> Figure:
 
     angles, time = pan_tilt_roll(motion), motion.frames / fps
     moves = bool(np.ptp(motion.centre, axis=0).max() > 0)
-    with matplotlib.rc_context(STYLE):
+    style: Any = STYLE
+    with matplotlib.rc_context(style):
         figure = Figure(figsize=(8.5, 6.6 if moves else 5.4), layout="constrained")
         panels = figure.subplots(4 if moves else 3, 1, sharex=True)
         world = "levelled world" if motion.levelled else "from the first frame that is known"

@@ -100,7 +100,7 @@ def step_between(a: np.ndarray, b: np.ndarray, threshold: float) -> TwoView | No
     """A turn and the direction of a step, by the essential matrix [t]× R.
 
     RANSAC, RANSAC with local optimisation and MAGSAC++ (Barath et al. 2020), all of OpenCV, sample it, since
-    each alone now and then ends in a wrong motion. Sampson's distance (Hartley and Zisserman 2004, eq. 11.9) is
+    each alone now and then ends in a wrong motion. Sampson's distance (Hartley, Zisserman 2004, eq. 11.9) is
     then least over the five parameters with Cauchy's loss, and the best of the three is kept.
 
     Parameters
@@ -135,7 +135,12 @@ def _refined_step(
         return rotation_matrix(change[:3]) @ turn, direction
 
     for _ in range(2):  # once with the sampled inliers, once with those of the refined model
-        change, information, scale = _refined(lambda c, m=near: sampson(u[m], v[m], *model(c))[:, None], 5)
+        used, seen = u[near], v[near]
+
+        def residual(c: np.ndarray, used: np.ndarray = used, seen: np.ndarray = seen) -> np.ndarray:
+            return sampson(used, seen, *model(c))[:, None]
+
+        change, information, scale = _refined(residual, 5)
         rotation, direction = model(change)
         left = np.abs(sampson(u, v, rotation, direction))
         near = (left < _OUTLIER * scale) & in_front(u, v, rotation, direction)
