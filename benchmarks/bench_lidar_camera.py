@@ -1,8 +1,9 @@
 """Hand calibration on simulated picks: errors of held-out pairs against their noise floor and the bound.
 
-``python benchmarks/bench_lidar_camera.py [RECORDINGS]``: for all targets, numbers of pairs and distances, the RMSE of 60 held-out pairs over so many simulated recordings (12 unless told), divided by what the true
-cameras give on the same pairs. Beside it the Cramér-Rao bound of that ratio for the same pairs and prior
-knowledge: what no unbiased estimate can pass. Picks: 1 px in the image, 2 cm in range.
+``python benchmarks/bench_lidar_camera.py [RECORDINGS]``: for all targets, numbers of pairs and distances, the
+RMSE of 60 held-out pairs over so many simulated recordings (12 unless told), divided by what the true cameras
+give on the same pairs. Beside it the Cramér-Rao bound of that ratio for the same pairs and prior knowledge.
+Picks: 1 px in the image, 2 cm in range.
 """
 
 import sys

@@ -9,7 +9,7 @@ from acino_fte.data_tools.lidar_solve_model import PickNoise, pick_covariance, p
 
 LENSES = (("log_aspect",), ("k1",), ("k1", "k2"), ("log_aspect", "k1"), ("log_aspect", "k1", "k2"))
 """What may be added to focal length and principal point, the simplest first."""
-_SURE = 2.0  # standard errors by which the pairs that were left out must be foreseen better
+_SURE = 3.0  # standard errors by which the pairs that were left out must be foreseen better
 
 
 def left_out(fit: Fit) -> np.ndarray:
@@ -38,7 +38,7 @@ def left_out_squared(fit: Fit) -> np.ndarray:
 def choose_lens(fit: Fit, pixel: np.ndarray, xyz: np.ndarray, noise: PickNoise) -> Fit:
     """The fit with the parameters of the lens that pairs left out support; the given one, if none.
 
-    A lens with more parameters is taken where it foresees left-out pairs better by two standard errors, and
+    A lens with more parameters is taken where it foresees left-out pairs better by three standard errors, and
     by more than a simpler one does.
     """
     base = fit.names
