@@ -14,6 +14,7 @@ from acino_fte.errors import InputError, did_you_mean
 from acino_fte.evaluation_runs import Run
 
 _QUALITY = 88
+_ASPECT = 0.01
 
 
 @dataclass
@@ -68,8 +69,8 @@ def pictures_of_run(run: Run, videos: Sequence[str], folders: Sequence[str]) -> 
     Raises
     ------
     InputError
-        A camera, a video or a folder does not exist, it has no picture of the run's frames, or pictures of
-        another size than the camera's.
+        A camera, a video or a folder does not exist, it has no picture of the run's first frame, or
+        pictures of another shape than the camera's. Smaller ones are enlarged.
     """
     pictures = Pictures()
     for text in videos:
@@ -89,12 +90,12 @@ def _add(
     first = int(run.frames[0])
     pixels = source(first)
     width, height = run.cameras[camera].resolution
-    if pixels.shape[:2] != (height, width):
+    if abs(pixels.shape[1] * height / (pixels.shape[0] * width) - 1) > _ASPECT:
         raise InputError(
             f"The pictures are not of camera '{camera}' as it was calibrated.",
             file=path,
             key=key,
-            expected=f"{width} x {height} px",
+            expected=f"{width} x {height} px, or smaller of the same shape",
             found=f"{pixels.shape[1]} x {pixels.shape[0]} px",
             remedy="give the video that the keypoints were found in",
         )

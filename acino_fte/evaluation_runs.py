@@ -5,9 +5,10 @@ Shapes: N frames, C cameras, M markers.
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -21,7 +22,7 @@ from acino_fte.errors import InputError, did_you_mean
 if TYPE_CHECKING:
     from acino_fte.skeleton import Skeleton
 
-DATA, METRICS, SEQUENCE = "fte.nc", "metrics.json", "sequence.yaml"
+DATA, METRICS, SEQUENCE, DEPTH = "fte.nc", "metrics.json", "sequence.yaml", "depth.csv"
 _NEEDED = ("position", "detection", "residual", "frame", "keypoints", "camera")
 _AGREE_PX = 0.5
 _AGAIN = "run the trajectory estimation to its end (acino-fte run SEQUENCE -o FOLDER)"
@@ -197,7 +198,7 @@ def open_run(folder: Path | str) -> Run:
     identity = sha256((folder / DATA).read_bytes()).hexdigest()
     data = _Data.read(folder / DATA)
     pixels = ("time", "camera", "keypoints", "pixel")
-    return Run(
+    run = Run(
         folder=folder,
         name=folder.resolve().name,
         identity=identity,
@@ -209,10 +210,30 @@ def open_run(folder: Path | str) -> Run:
         positions=data.ordered("position", ("individuals", "time", "keypoints", "space"))[0],
         detection=data.ordered("detection", pixels),
         residual=data.ordered("residual", pixels),
-        depth_residual=data.ordered("depth_residual", ("time", "keypoints"))
-        if "depth_residual" in data.variables
-        else None,
     )
+    return replace(run, depth_residual=_depth(run)) if (folder / DEPTH).is_file() else run
+
+
+def _depth(run: Run) -> np.ndarray:
+    """(N, M) predicted − measured depth of ``depth.csv``, m; NaN where there is none."""
+    residual = np.full(run.positions.shape[:2], np.nan)
+    path = run.folder / DEPTH
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                n, m = int(row["frame"]) - int(run.frames[0]), run.markers.index(row["marker"])
+                if not 0 <= n < len(run.frames):
+                    raise ValueError(f"frame {row['frame']}, which is not in the run")
+                residual[n, m] = float(row["predicted"]) - float(row["measured"])
+    except (KeyError, ValueError, TypeError, OSError, csv.Error) as error:
+        raise InputError(
+            "The depths of the run cannot be read.",
+            file=path,
+            expected="columns frame, marker, measured, predicted of the run's frames and markers",
+            found=str(error) or type(error).__name__,
+            remedy=_AGAIN,
+        ) from None
+    return residual
 
 
 def _check_folder(folder: Path) -> None:
@@ -323,8 +344,6 @@ def open_runs(folders: Sequence[Path]) -> list[Run]:
     InputError
         One of them is no run, or is given twice.
     """
-    from dataclasses import replace
-
     seen: set[Path] = set()
     for folder in folders:
         whole = folder.expanduser().resolve()

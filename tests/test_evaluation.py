@@ -310,6 +310,9 @@ def test_depth_of_a_run_with_a_lidar(copied):
     assert rows["r_hip"]["n"] == 0 and rows["r_hip"]["rmse"] is None
     (axes,) = depth_histograms([run], [run]).axes
     assert "n 4" in axes.texts[0].get_text()
+    for text in ("frame,marker\n10,nose\n", "frame,marker,measured,predicted\n9,nose,1,2\n"):
+        (copied / "depth.csv").write_text(text, encoding="utf-8")
+        assert "depths of the run" in str(message(open_run, copied))
 
 
 def test_depth_of_a_run_that_wrote_only_metrics(copied):
