@@ -184,6 +184,15 @@ def same_clock() -> DeviceClock:
     return DeviceClock(0.0, 0.0, (piece,))
 
 
+def offset_clock(device_ns: np.ndarray, received_ns: np.ndarray, sd_ms: float) -> DeviceClock:
+    """A clock without drift, of too few messages (K,) to fit one: the shortest delay counts as zero."""
+    device, received = _integers(device_ns, "device_ns"), _integers(received_ns, "received_ns")
+    i = int((received - device).argmin())
+    stretch = (int(device.min()), int(device.max())), (int(received.min()), int(received.max()))
+    piece = ClockPiece(*stretch, int(device[i]), int(received[i]), len(device), sd_ms)
+    return DeviceClock(0.0, 0.0, (piece,))
+
+
 def fit_clock(device_ns: np.ndarray, received_ns: np.ndarray, *, jumps: bool = True) -> DeviceClock:
     """Fit a device's stamps to the times at which its messages were received.
 

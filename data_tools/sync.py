@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from acino_fte.data_tools.clocks import DeviceClock, fit_clock, same_clock
+from acino_fte.data_tools.clocks import DeviceClock, fit_clock, offset_clock, same_clock
 from acino_fte.data_tools.sync_events import Event, lag_of
 from acino_fte.data_tools.sync_grid import Dropped, FrameGrid, dropped_runs, frame_grid
 from acino_fte.errors import InputError
 
 _JITTERY_MS = 0.5  # stamps that scatter more are times of reception, whatever they are called
+_GUESS_MS = 10.0  # standard deviation of the delay of single messages
 _HALF_FRAME = 1 / np.sqrt(12)  # standard deviation of an event known to a frame, frames
 
 
@@ -115,8 +116,11 @@ def clock_of(stamps: Stamps) -> tuple[DeviceClock, tuple[str, ...]]:
     """
     if stamps.received_ns is None:
         return same_clock(), ()
-    if len(stamps) < 3 or np.array_equal(stamps.device_ns, stamps.received_ns):
+    if np.array_equal(stamps.device_ns, stamps.received_ns):
         return same_clock(), ("stamps are times of reception",)
+    if len(np.unique(stamps.device_ns)) < 3:
+        note = f"{len(stamps)} messages are too few to fit a clock; their delay is a guess"
+        return offset_clock(stamps.device_ns, stamps.received_ns, _GUESS_MS), (note,)
     clock = fit_clock(stamps.device_ns, stamps.received_ns)
     notes = tuple(str(jump) for jump in clock.jumps)
     if clock.is_computers:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acino_fte.data_tools.sync import Stamps, even_losses, from_motion, from_pivot, from_stamps
+from acino_fte.data_tools.sync import Stamps, clock_of, even_losses, from_motion, from_pivot, from_stamps
 from acino_fte.data_tools.sync_events import image_motion, knock, lag_of, led_step, region_brightness
 from acino_fte.data_tools.sync_grid import Dropped, frame_grid
 from acino_fte.data_tools.sync_match import match_video
@@ -51,6 +51,13 @@ def test_hardware_stamps_tell_every_dropped_frame():
     assert sync.fps == pytest.approx(FPS, rel=1e-5)
     assert np.abs(sync.frame_time - time).max() * 1e3 < 0.1
     assert sync.method == "stamps"
+
+
+def test_two_messages_tell_an_offset_only():
+    clock, notes = clock_of(Stamps(np.array([5, 105]) * 10**6, T0 + np.array([9, 107]) * 10**6))
+    assert clock.to_computer_ns(np.array([200 * 10**6])) == T0 + 202 * 10**6
+    assert clock.sd_ms >= 5
+    assert "too few" in notes[0]
 
 
 def test_a_run_of_drops_is_one_entry():
