@@ -5,8 +5,10 @@ from __future__ import annotations
 import typer
 
 from acino_fte import (
+    cli_calibrate,
     cli_compare,
     cli_match,
+    cli_motion,
     cli_run,
     cli_scene,
     cli_simulate,
@@ -29,6 +31,8 @@ app.command("scene")(cli_scene.scene)
 app.command("simulate")(cli_simulate.simulate)
 app.command("simulate-scene")(cli_simulate_scene.simulate_scene)
 app.command("simulate-rig")(cli_simulate_rig.simulate_rig)
+app.command("calibrate-lidar")(cli_calibrate.calibrate_lidar)
+app.command("camera-motion")(cli_motion.camera_motion)
 app.add_typer(cli_skeleton.app, name="skeleton")
 
 
