@@ -10,7 +10,8 @@ at a lateral distance g (m, at the depth of the return), and the return lies f =
 is attached to the link with the least (g/σ_g)² + ((f − c s)/σ_f)², where s is the surface of that link and
 c = √(1 − (g/s)²) how much of it a round body has there, and to none when that is large: grass, bushes and a
 neighbour fail along the ray although they are near in the image. What is attached is moved to the time of its
-frame with the link.
+frame with the link. A link that lies behind another one on the same ray, such as the far shoulder behind the
+near one, is hidden by it and costs more.
 
 The thesis's way stays for comparison: the nearest return in the image of a whole scan, whatever its depth.
 Shapes: K returns, N frames, M markers, E links to draw.
@@ -39,6 +40,7 @@ _LEAST_BULGE = 0.3
 _SLOPE = 0.15  # of the way from a return to its marker along the link, as depth that the pose may be wrong by
 _SCAN = 0.1  # s: what the thesis takes for one frame of the lidar
 _NEAREST_SD = 0.05  # m, of the thesis's way
+_HIDDEN_SD, _HIDDEN = 0.04, 4.0  # m: how well it is known what hides what; the most that being hidden costs
 _MARGIN = 0.1  # of the picture's size: how far outside it returns still count
 _WIDEST = 0.5  # m: σ_f is never more
 
@@ -167,6 +169,8 @@ def attach(
     width = min(front_sd, _WIDEST)
     reach = np.maximum(_SIDE, radius)
     cost = (side / reach) ** 2 + ((front - bulge * radius) / width) ** 2
+    hidden = _behind(xyz[:, 2:] + front - bulge * radius, side < radius)
+    cost += np.minimum((hidden / _HIDDEN_SD) ** 2, _HIDDEN)
     best = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=1) if len(xyz) else np.zeros(0, int)
     every = np.arange(len(xyz))
     good = cost[every, best] < _GATE
@@ -184,6 +188,12 @@ def attach(
         bulge[every, best],
         (xyz[every] + moved)[:, 2],
     )
+
+
+def _behind(surface: np.ndarray, hit: np.ndarray) -> np.ndarray:
+    """How far surfaces (K, E), m, lie behind the nearest one that the ray hits; 0 where it hits none."""
+    nearest = np.where(hit, surface, np.inf).min(axis=1, keepdims=True, initial=np.inf)
+    return np.where(np.isfinite(nearest), np.maximum(surface - nearest, 0.0), 0.0)
 
 
 def _bulge(side: np.ndarray, radius: np.ndarray) -> np.ndarray:

@@ -13,9 +13,18 @@ at √(r² − g²) = c r before the axis, so
     d = z((1 − u) p_a + u p_b) − c ((1 − u) s_a + u s_b) − z̃,
 
 with 0 ≤ u ≤ 1 and c held as they were when the return was attached. (The distance from the axis less r is no
-substitute: with a range noise of the size of r it has no sign, and draws the animal onto its own skin.) The
-surface s has a Gaussian prior about what the body's capsules, or a limb's usual thickness, let expect. Which
-return belongs to what is decided by :mod:`acino_fte.association`.
+substitute: with a range noise of the size of r it has no sign, and draws the animal onto its own skin.)
+
+The surface is expected at o_m, the radius of the body's capsules or a limb's usual thickness. An animal may
+be thicker or hairier than that everywhere, and each part of it again by itself:
+
+    s_m = o_m (1 + κ + δ_m),   κ ~ N(0, σ_κ²),   δ_m ~ N(0, σ_δ²).
+
+With κ integrated out, φ_m = s_m/o_m − 1 has the covariance σ_δ² I + σ_κ² 11ᵀ, which is whitened by
+(φ_m − β φ̄)/σ_δ, φ̄ the mean of the φ and β = 1 − σ_δ/√(σ_δ² + M σ_κ²). Independent priors would claim to know
+the mean of all surfaces, and with it the depth of the animal, √M times too well.
+
+Which return belongs to what is decided by :mod:`acino_fte.association`.
 """
 
 from __future__ import annotations
@@ -32,7 +41,7 @@ from acino_fte.cameras import Camera
 from acino_fte.losses import Loss
 from acino_fte.parameters import POSE, Parameters
 from acino_fte.residuals import AXES, Derived, Handle, Let, Residual
-from acino_fte.terms import POSE_NAMES, Term, in_camera, moved_in_camera, pose_data
+from acino_fte.terms import POSE_NAMES, Term, combination_residual, in_camera, moved_in_camera, pose_data
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -40,8 +49,9 @@ if TYPE_CHECKING:
     from acino_fte.skeleton import Skeleton
 
 LIMB = 0.03
-"""How far the surface lies before a joint of a limb, m, and the standard deviation of that."""
-_SHARE = 0.5  # standard deviation of a surface that the species' capsules tell, as a share of their radius
+"""How far the surface lies before a joint of a limb, m."""
+COMMON, OWN = 0.3, 0.6
+"""Standard deviations of the surface as a share of what is expected: of all together, and of each."""
 _SOURCES = (Path(__file__), Path(terms.__file__))
 
 
@@ -123,16 +133,28 @@ class DepthData:
     loss: Loss = field(default_factory=lambda: Loss("geman_mcclure"))
 
 
-def surface_prior(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
-    """Expected distance of the surface before every marker (M,), m, and its standard deviation (M,), m.
+def expected_surface(skeleton: Skeleton) -> np.ndarray:
+    """Expected distance of the surface before every marker (M,), m.
 
     The radius of the species' widest capsule that ends there, else :data:`LIMB`.
     """
     mean = np.zeros(len(skeleton.markers))
     for a, b, radius in skeleton.capsules:
         mean[[a, b]] = np.maximum(mean[[a, b]], radius)
-    mean = np.where(mean > 0, mean, LIMB)
-    return mean, np.maximum(_SHARE * mean, LIMB)
+    return np.where(mean > 0, mean, LIMB)
+
+
+def surface_term(parameters: Parameters) -> Term:
+    """The joint prior of the surface's parameters."""
+    places = parameters.of_family("surface")
+    expected, count = _origins(parameters)[places], len(places)
+    beta = 1 - OWN / np.sqrt(OWN**2 + count * COMMON**2)
+    whitening = (np.eye(count) - beta / count) / expected  # (instances, parameters)
+    data = {f"a{i}": whitening[:, i] for i in range(count)}
+    residual = combination_residual(count, "surface", "of the expected distance")
+    items, numbers = np.tile(places, (count, 1)), np.arange(count)
+    frames, sd = np.zeros(count, dtype=int), np.full(count, OWN)
+    return Term("surface", residual, frames, items, data, sd, numbers=numbers)
 
 
 def depth_terms(data: DepthData, camera: Camera, n_frames: int, parameters: Parameters) -> list[Term]:

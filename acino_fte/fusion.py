@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from acino_fte.association import associate
-from acino_fte.depth import BodyReturns, DepthData, MarkerDepths, surface_prior
+from acino_fte.depth import BodyReturns, DepthData, MarkerDepths, expected_surface
 from acino_fte.noise import PRIOR_COUNT, robust_scale
 from acino_fte.parameters import Parameters
 from acino_fte.sequence import Sequence
@@ -91,7 +91,7 @@ class Fusion:
     def __init__(self, sequence: Sequence, skeleton: Skeleton, how: str, pixels: np.ndarray) -> None:
         self.sequence, self.skeleton, self.how = sequence, skeleton, how
         self.used = sequence.lidar is not None and how != "none"
-        self.surface = surface_prior(skeleton)[0]
+        self.surface = expected_surface(skeleton)
         self.data: DepthData | None = None
         self.factor = 1.0
         self._looks = 0

@@ -9,7 +9,7 @@ family is judged given those before it, which keep their priors,
 in units of its prior's standard deviations: an eigenvalue below a tenth is a direction of which the data say
 next to nothing (they narrow the prior by less than 5 %), and does not count for the rank. The size of the set
 of cameras, which no picture shows, is held by a term of its own (:func:`acino_fte.terms.size_terms`); its
-direction counts as known.
+direction counts as known. The surface that a lidar sees is always a parameter, and given from the start.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def observable(
     except NotPositiveDefinite:
         whitened = np.zeros((len(parameters), len(parameters)))
     result: list[Observability] = []
-    given = np.empty(0, dtype=int)
+    given = parameters.of_family("surface")
     for family in chosen:
         places = parameters.of_family(family)
         judged = _judge(family, parameters, places, _given(whitened, places, given))

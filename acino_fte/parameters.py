@@ -92,6 +92,7 @@ class PriorWidths:
 
 
 _REACH = 5.0  # bounds, in prior standard deviations
+_REACH_SURFACE = 3.0  # beyond that, a return is on something else
 _REACH_DELAY = 3.0  # of half a frame: beyond one and a half frames, the stencil extrapolates
 
 
@@ -167,11 +168,11 @@ def declare(
     return Parameters(tuple(entries))
 
 
-def with_surface(parameters: Parameters, markers: list[str], mean: np.ndarray, sd: np.ndarray) -> Parameters:
-    """The same with one distance of the surface for each marker: prior mean and sd (M,), m."""
+def with_surface(parameters: Parameters, markers: list[str], expected: np.ndarray, sd: float) -> Parameters:
+    """The same with a distance of the surface for each marker: expected (M,), m, and sd as a share of it."""
     entries = [
-        Parameter("surface", marker, "", float(s), _REACH * float(s), float(m))
-        for marker, m, s in zip(markers, mean, sd, strict=True)
+        Parameter("surface", marker, "", sd * float(m), _REACH_SURFACE * sd * float(m), float(m))
+        for marker, m in zip(markers, expected, strict=True)
     ]
     return Parameters((*parameters.entries, *entries))
 

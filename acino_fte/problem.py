@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from acino_fte import delay
-from acino_fte.depth import DepthData, depth_terms, surface_prior
+from acino_fte.depth import COMMON, OWN, DepthData, depth_terms, expected_surface, surface_term
 from acino_fte.errors import InputError
 from acino_fte.kinematics import Kinematics
 from acino_fte.losses import Loss
@@ -210,7 +210,8 @@ def build_fte(
         sd = np.array([m.sd_px for m in skeleton.markers])
     parameters = _parameters(sequence, skeleton, options)
     if assumed.depth is not None and assumed.depth.surface:
-        parameters = with_surface(parameters, skeleton.marker_names, *surface_prior(skeleton))
+        expected, share = expected_surface(skeleton), float(np.hypot(COMMON, OWN))
+        parameters = with_surface(parameters, skeleton.marker_names, expected, share)
     terms = [
         measurement_term(camera, pixels[:, c], sd, options.loss, sequence.n_frames, parameters)
         for c, camera in enumerate(sequence.cameras)
@@ -225,6 +226,7 @@ def build_fte(
     if assumed.depth is not None:
         camera = sequence.cameras[assumed.depth.camera]
         present += depth_terms(assumed.depth, camera, sequence.n_frames, parameters)
+        present += [surface_term(parameters)] if assumed.depth.surface else []
     if {"scale", "extrinsics"} <= set(parameters.families):
         present += size_terms(parameters, sequence.cameras, options.widths.size)
     factors = 1.0 if assumed.noise_factors is None else assumed.noise_factors

@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from acino_fte.association import associate
 from acino_fte.cameras import Camera
-from acino_fte.depth import DepthData, MarkerDepths, depth_terms, surface_prior
+from acino_fte.depth import DepthData, MarkerDepths, depth_terms, expected_surface
 from acino_fte.errors import InputError
 from acino_fte.initialise import pose_start
 from acino_fte.kinematics import Kinematics
@@ -117,7 +117,7 @@ def animal_depth(sequence: Sequence, kinematics: Kinematics, pixels: np.ndarray)
     near = np.abs(depth - (ratio * size)[frame]) < _TOLERANCE
     if near.any():
         ratio = _running_median(frame[near], depth[near] / size[frame[near]], len(size), sequence.fps)
-    return ratio * size + float(np.median(surface_prior(skeleton)[0]))
+    return ratio * size + float(np.median(expected_surface(skeleton)))
 
 
 def surface_ratio(frame: np.ndarray, ratio: np.ndarray, size: np.ndarray, fps: float) -> np.ndarray:
@@ -282,7 +282,7 @@ def _depth_terms(
     flat = MarkerDepths(frame, marker, depth[frame], sd, np.ones(len(frame), dtype=int))
     if sequence.lidar is None:
         return []
-    surface = surface_prior(kinematics.skeleton)[0]
+    surface = expected_surface(kinematics.skeleton)
     found = associate(sequence, kinematics.skeleton, kinematics.positions(start), surface, front_sd=_FLAT_SD)
     data = [DepthData(camera.name, flat, surface=False, loss=Loss("squared"))]
     terms = depth_terms(data[0], camera, sequence.n_frames, Parameters())

@@ -220,23 +220,22 @@ def prior_term(skeleton: Skeleton, n_frames: int, width: float) -> Term:
 
 
 def parameter_term(parameters: Parameters) -> Term:
-    """Gaussian prior of every global parameter."""
-    n = len(parameters)
-    return Term(
-        "parameter", WIDTH, np.zeros(n, dtype=int), np.arange(n)[:, None], {"mean": 0.0}, parameters.sd
-    )
+    """Gaussian prior of every global parameter but the surface's, which are not independent."""
+    items = np.array([i for i, p in enumerate(parameters.entries) if p.family != "surface"], dtype=int)
+    frames = np.zeros(len(items), dtype=int)
+    return Term("parameter", WIDTH, frames, items[:, None], {"mean": 0.0}, parameters.sd[items])
 
 
 @cache
-def _size_residual(count: int) -> Residual:
-    """Relative change in size of the set of cameras, Σ a_i·d_i over the shifts d of its cameras."""
+def combination_residual(count: int, name: str, unit: str) -> Residual:
+    """A linear combination of parameters, Σ a_i θ_i."""
 
     def derive(handles: list[Any], data: dict[str, sp.Symbol], _let: Let) -> Derived:
         return [sum(data[f"a{i}"] * handle for i, handle in enumerate(handles))], []
 
     handles = tuple(Handle("parameter", item=i) for i in range(count))
     data = tuple(f"a{i}" for i in range(count))
-    return Residual(f"size-{count}", handles, data, ("size",), "1", derive, _HERE)
+    return Residual(f"{name}-{count}", handles, data, (name,), unit, derive, _HERE)
 
 
 def size_terms(parameters: Parameters, cameras: CameraArray, sd: float) -> list[Term]:
@@ -259,7 +258,7 @@ def size_terms(parameters: Parameters, cameras: CameraArray, sd: float) -> list[
         return []
     data = {f"a{i}": w for i, w in enumerate(weights)}
     frame, items = np.zeros(1, dtype=int), np.array([places])
-    return [Term("size", _size_residual(len(places)), frame, items, data, np.array([sd]))]
+    return [Term("size", combination_residual(len(places), "size", "1"), frame, items, data, np.array([sd]))]
 
 
 def point_term(points: np.ndarray, sd: float | np.ndarray, loss: Loss) -> Term:
