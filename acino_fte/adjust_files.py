@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
 from pathlib import Path
 from secrets import token_hex
 from typing import Literal
@@ -182,7 +183,8 @@ def write_whole(path: Path, text: str) -> None:
             os.fsync(file.fileno())
         working.replace(path)
     except OSError as error:
-        working.unlink(missing_ok=True)
+        with suppress(OSError):
+            working.unlink()
         raise InputError(
             "The file cannot be written; what it held before is still there.",
             file=path,

@@ -30,8 +30,10 @@ function select(m) {
   marker = (m + about.markers.length) % about.markers.length;
   if (!data) return;
   refreshList(); draw(); space.draw();
-  const row = document.querySelectorAll('#adjust-list tbody tr')[marker];
-  row.scrollIntoView({ block: 'nearest' });
+  reveal();
+}
+function reveal() {  // the chosen row of the list
+  document.querySelectorAll('#adjust-list tbody tr')[marker].scrollIntoView({ block: 'nearest' });
 }
 function refreshBar() {
   by('adjust-slider').value = wanted;

@@ -145,6 +145,7 @@ function receive(answer, chosen) {
   for (const v of views) picture(v, data.frame);
   if (data.frame === wanted) for (const v of views) for (const k of [1, 2, -1]) picture(v, data.frame + k);
   refreshBar(); refreshList(); draw(); space.draw();
+  if (typeof chosen === 'number') reveal();
 }
 function stale() { asked = 0; go(wanted); }  // something changed it
 

@@ -44,14 +44,14 @@ class AdjustSession:
         Of the file of adjustments.
     large_px : float
         Frames with a residual beyond it are worth a look, px.
-    problem : str
-        Why the last change could not be saved; empty when it could.
+    error : InputError, optional
+        Why the last change could not be saved.
     """
 
     document: Adjustments
     path: Path
     large_px: float = 0.0
-    problem: str = ""
+    error: InputError | None = None
     _shift: dict[str, np.ndarray] = field(default_factory=dict)
     _written: str | None = None
 
@@ -70,6 +70,11 @@ class AdjustSession:
     def run(self) -> Run:
         """The run."""
         return self.document.run
+
+    @property
+    def problem(self) -> str:
+        """Why the last change could not be saved; empty when it could."""
+        return "" if self.error is None else str(self.error)
 
     # --- what is shown -----------------------------------------------------------------------------
 
@@ -254,7 +259,7 @@ class AdjustSession:
         return None
 
     def save(self) -> None:
-        """Write the file; when it cannot be written, ``problem`` says why and nothing is lost here."""
+        """Write the file; when it cannot be written, ``error`` says why and nothing is lost here."""
         try:
             if self.path.exists() and _digest(self.path) != self._written:
                 raise InputError(
@@ -265,9 +270,9 @@ class AdjustSession:
             text = as_text(self.document)
             write_whole(self.path, text)
             self._written = sha256(text.encode()).hexdigest()
-            self.problem = ""
+            self.error = None
         except InputError as error:
-            self.problem = str(error)
+            self.error = error
 
     def export(self) -> Path:
         """Write the adjusted positions as CSV beside the file of adjustments."""
@@ -304,10 +309,8 @@ def open_session(run: Run, path: Path, large_px: float | None = None) -> AdjustS
     document = read_adjustments(path, [run]) if path.exists() else Adjustments(run)
     session = AdjustSession(document, path, large_px or 0.0)
     session.save()
-    if session.problem:
-        raise InputError(
-            "The adjustments could not be saved.", file=path, found=session.problem.splitlines()[-1]
-        )
+    if session.error is not None:
+        raise session.error
     return session
 
 

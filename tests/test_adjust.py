@@ -256,6 +256,11 @@ def test_what_cannot_be_saved_is_said_and_kept(session, monkeypatch, tmp_path):
     assert not session.problem and len(read_adjustments(session.path, [session.run]).entries) == 1
 
 
+def test_a_file_that_cannot_be_written_is_told_before_any_work(run, tmp_path):
+    (tmp_path / "file").write_text("x", encoding="utf-8")
+    assert "cannot be written" in str(message(open_session, run, tmp_path / "file" / "a.json"))
+
+
 def test_the_work_of_another_program_is_not_overwritten(run, tmp_path):
     first, second = (open_session(run, tmp_path / "a.json") for _ in range(2))
     first.check(12)
