@@ -16,6 +16,7 @@ from acino_fte.cli_common import reported_errors, spinner, stdout, warn
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:
+    from acino_fte.data_tools.import_motion import Encoders
     from acino_fte.data_tools.import_recording import ImportOptions
 
 _INPUT, _RECORDING, _TIME, _OUTPUT = "Input", "Recording", "Time", "Output"
@@ -23,6 +24,7 @@ _INPUT, _RECORDING, _TIME, _OUTPUT = "Input", "Recording", "Time", "Output"
 
 class _Motion(StrEnum):
     imu = "imu"
+    encoders = "encoders"
     none = "none"
 
 
@@ -77,11 +79,37 @@ def import_recording(
     motion: Annotated[
         _Motion | None,
         typer.Option(
-            help="What tells how the camera turned: the inertial sensor in the lidar, or nothing (it stood).",
+            help="What tells how the camera turned: the inertial sensor in the lidar, the encoders of its "
+            "head, or nothing (it stood).",
             rich_help_panel=_RECORDING,
             show_default="imu where there is one",
         ),
     ] = None,
+    counts_per_turn: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PAN,TILT",
+            help="Counts of the encoders in a whole turn; negative where they grow to the right, or down.",
+            rich_help_panel=_RECORDING,
+        ),
+    ] = None,
+    encoder_zero: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PAN,TILT",
+            help="Counts where the camera looks along the world's x, and level.",
+            rich_help_panel=_RECORDING,
+            show_default="those of the first frame",
+        ),
+    ] = None,
+    encoders: Annotated[
+        str,
+        typer.Option(
+            metavar="PAN,TILT",
+            help="Which of the numbers in the camera's messages they are, from 0.",
+            rich_help_panel=_RECORDING,
+        ),
+    ] = "2,3",
     frames: Annotated[
         str | None,
         typer.Option(
@@ -168,6 +196,7 @@ def import_recording(
             expected=exposed,
             margin_px=margin_px,
             motion=motion.value if motion is not None else None,
+            encoders=_encoders(counts_per_turn, encoder_zero, encoders),
             range_sd=range_sd,
             pictures=pictures,
         )
@@ -209,6 +238,36 @@ def _frames(text: str | None) -> tuple[int | None, int | None]:
             expected="START:STOP, as 80:190",
             found=text,
         ) from None
+
+
+def _encoders(turns: str | None, zero: str | None, places: str) -> Encoders | None:
+    """What the encoders count, where it is given."""
+    from acino_fte.data_tools.import_motion import Encoders
+
+    if turns is None:
+        return None
+    pan, tilt = _pair("--counts-per-turn", turns)
+    if not pan or not tilt:
+        raise InputError("A turn has counts.", key="--counts-per-turn", expected="other than 0", found=turns)
+    which = _pair("--encoders", places)
+    if any(place < 0 or place != int(place) for place in which):
+        raise InputError("There are no such encoders.", key="--encoders", expected="2,3", found=places)
+    return Encoders(
+        (pan, tilt), None if zero is None else _pair("--encoder-zero", zero), (int(which[0]), int(which[1]))
+    )
+
+
+def _pair(key: str, text: str) -> tuple[float, float]:
+    """Two numbers with a comma between them."""
+    try:
+        first, second = (float(part) for part in text.split(","))
+        if not (math.isfinite(first) and math.isfinite(second)):
+            raise ValueError(text)
+    except ValueError:
+        raise InputError(
+            "Two numbers are expected, for pan and tilt.", key=key, expected="as 4000,4000", found=text
+        ) from None
+    return first, second
 
 
 def _check(options: ImportOptions) -> None:

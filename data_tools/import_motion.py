@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,6 +67,81 @@ def posed_camera(
     sd = float(np.degrees(np.nanmax(found.rotation_sd)))
     notes = (*found.notes, f"the camera's attitude is known to {sd:.2f}° at worst")
     return Poses(camera_with_motion(lens, found, anchor="motion"), "imu", notes)
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """What the encoders of a pan-tilt head count.
+
+    Attributes
+    ----------
+    counts_per_turn : (pan, tilt)
+        Of a whole turn, gears included; negative where counts grow to the right, or downwards.
+    zero : (pan, tilt), optional
+        Counts where the camera looks along the world's x, and level; by default those of the first frame.
+    places : (pan, tilt)
+        Which numbers of a message they are, from 0.
+    """
+
+    counts_per_turn: tuple[float, float]
+    zero: tuple[float, float] | None = None
+    places: tuple[int, int] = (2, 3)
+
+
+def encoder_camera(
+    lens: Camera, counts: Sequence[tuple[int, ...]], place: np.ndarray, encoders: Encoders | None
+) -> Poses:
+    """A camera on a pan-tilt head, with a pose for every frame of the sequence.
+
+    Parameters
+    ----------
+    lens : Camera
+        Its lens.
+    counts : sequence of (numbers of the encoders), R of them
+        Of every recorded frame.
+    place : (R,) int
+        Their frames of the sequence; dropped frames between them are bridged.
+    encoders : Encoders, optional
+        What they count; it must be there.
+
+    Raises
+    ------
+    InputError
+        There are no counts, or what they count is not known.
+    """
+    from acino_fte.data_tools.camera_motion import camera_with_motion
+    from acino_fte.data_tools.pan_tilt import PanTiltHead, motion_from_encoders
+
+    if encoders is None:
+        raise InputError(
+            "What the encoders count is not known.",
+            key="--counts-per-turn",
+            expected="counts of a whole turn of pan and of tilt",
+            found="nothing",
+            remedy="give --counts-per-turn PAN,TILT; negative where counts grow to the right, or downwards",
+        )
+    pan, tilt = encoders.places
+    rows = [values for values in counts if len(values) > max(pan, tilt)]
+    if not rows or len(rows) < len(place):
+        raise InputError(
+            "The camera's messages have no such encoders.",
+            key="--encoders",
+            expected=f"numbers {pan} and {tilt} (from 0) in the message of every frame",
+            found=f"{len(rows)} of {len(place)} messages have them",
+        )
+    values = np.array([(row[pan], row[tilt]) for row in rows], dtype=float)
+    zero = encoders.zero or (float(values[0, 0]), float(values[0, 1]))
+    turns = encoders.counts_per_turn
+    head = PanTiltHead(
+        counts_per_turn=(abs(turns[0]), abs(turns[1])),
+        zero=zero,
+        sign=(1 if turns[0] > 0 else -1, 1 if turns[1] > 0 else -1),
+    )
+    frames = np.arange(int(place[-1]) + 1, dtype=float)
+    found = motion_from_encoders(values, head, time=place.astype(float), frame_time=frames)
+    level = () if encoders.zero else ("the camera is taken to be level in the first frame",)
+    posed = camera_with_motion(lens, found, anchor="motion")
+    return Poses(posed, "encoders", (*found.notes, *level))
 
 
 def _standing(lens: Camera, imu: ImuSamples | None) -> Poses:

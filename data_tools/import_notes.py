@@ -13,6 +13,7 @@ from acino_fte.data_tools.sync import Synchronisation
 
 FORMAT = "acino-fte/import/1"
 _RUNS = 200  # of dropped frames that import.json lists
+_ROUTES = {"imu": "turns, by the inertial sensor", "encoders": "turns, by the encoders", "none": "stands"}
 _WAYS = {"stamps": "the camera's stamps", "pivot": "the pivot", "motion": "the motion of the rig"}
 
 
@@ -127,7 +128,5 @@ def summary(content: dict[str, Any]) -> list[str]:
     lines += [f"  {note}" for note in sync["notes"]]
     dropped = f", {frames['n_dropped']} of them dropped by the camera" if frames["n_dropped"] else ""
     lines.append(f"{frames['n_frames']} frames{dropped}; {lidar['kept']} of {lidar['read']} lidar returns")
-    lines.append(
-        f"camera: {'turns, by the inertial sensor' if content['motion']['route'] == 'imu' else 'stands'}"
-    )
+    lines.append(f"camera: {_ROUTES[content['motion']['route']]}")
     return lines

@@ -18,7 +18,7 @@ import numpy as np
 
 from acino_fte.cameras import CameraArray
 from acino_fte.data_tools.import_lidar import write_returns
-from acino_fte.data_tools.import_motion import posed_camera
+from acino_fte.data_tools.import_motion import Encoders, Poses, encoder_camera, posed_camera
 from acino_fte.data_tools.import_notes import doubts, made_by, next_steps, recording_notes, sequence_notes
 from acino_fte.data_tools.import_pictures import MessagePictures, Pictures, VideoPictures, write_pictures
 from acino_fte.data_tools.import_scan import Scan, StreamScan, scan_recording
@@ -53,8 +53,10 @@ class ImportOptions:
         Frames that the camera exposed while it took the video.
     margin_px : float, optional
         Keep only lidar returns within the picture and this margin.
-    motion : {"imu", "none"}, optional
+    motion : {"imu", "encoders", "none"}, optional
         What tells how the camera turned.
+    encoders : Encoders, optional
+        What the encoders count.
     range_sd : float
         Of the lidar, m.
     pictures : bool
@@ -74,6 +76,7 @@ class ImportOptions:
     expected: int | None = None
     margin_px: float | None = None
     motion: str | None = None
+    encoders: Encoders | None = None
     range_sd: float = 0.02
     pictures: bool = True
 
@@ -308,9 +311,7 @@ class _Work:
         camera_name = self.calibration.name
         warnings = list(doubts(sync, self.inputs, self.calibration.camera.resolution))
         imu = self._imu(sync)
-        time_sd = 1e-3 * sync.sd_ms
-        even = np.arange(int(sync.place[-1]) + 1) / sync.fps
-        poses = posed_camera(self.calibration.camera, imu, even, self.options.motion, time_sd)
+        poses = self._poses(sync, imu)
         write_cameras(folder / "cameras.json", CameraArray((poses.camera,)))
         write_lidar_camera(folder / "lidar_camera.json", self.calibration)
         counts = self._lidar(folder, sync)
@@ -349,6 +350,18 @@ class _Work:
         order = np.argsort(time, kind="stable")
         order = order[np.append(True, np.diff(time[order]) > 0)]
         return ImuSamples(time[order], samples.rate[order], samples.force[order], samples.clock)
+
+    def _poses(self, sync: Synchronisation, imu: ImuSamples | None) -> Poses:
+        """The camera in every frame of the sequence."""
+        lens, motion = self.calibration.camera, self.options.motion
+        if motion == "encoders":
+            start, stop = self.inputs.frames
+            camera, rows = self.inputs.camera, self.timing.rows
+            counts = camera.encoders if camera is not None and rows is not None else []
+            mine = [counts[i] for i in rows[start:stop]] if counts and rows is not None else []
+            return encoder_camera(lens, mine, sync.place, self.options.encoders)
+        even = np.arange(int(sync.place[-1]) + 1) / sync.fps
+        return posed_camera(lens, imu, even, motion, 1e-3 * sync.sd_ms)
 
     def _lidar(self, folder: Path, sync: Synchronisation) -> dict[str, int]:
         around = _AROUND / sync.fps

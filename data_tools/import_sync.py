@@ -97,12 +97,14 @@ class Inputs:
 class Timing:
     """Clocks of the lidar and of the inertial sensor, and the times of the frames.
 
-    Second zero is the lidar's first return.
+    Second zero is the lidar's first return. `rows` (N,) are the camera's messages of the frames, where there
+    are some.
     """
 
     sync: Synchronisation
     lidar: DeviceClock
     imu: DeviceClock
+    rows: np.ndarray | None = None
 
     def seconds(
         self, clock: DeviceClock, stamps: np.ndarray, received: np.ndarray | int | None
@@ -126,12 +128,15 @@ def synchronise(inputs: Inputs) -> Timing:
     imu = _imu_clock(inputs, lidar)
     timing = Timing(_placeholder(origin), lidar, imu)
     stamped = inputs.camera is not None and bool(inputs.camera.received)
-    sync = _by_stamps(inputs, timing) if stamped else _by_event(inputs, timing)
+    if stamped:
+        sync, rows = _by_stamps(inputs, timing)
+    else:
+        sync, rows = _by_event(inputs, timing), None
     if not inputs.lidar.spread and inputs.lidar.rate > 0:
         length = 1e3 / inputs.lidar.rate
         notes = (*notes, f"all returns of a message have one stamp, so that each is known to {length:.0f} ms")
         sync = replace(sync, frame_sd_ms=np.hypot(sync.frame_sd_ms, length / np.sqrt(12)))
-    return Timing(replace(sync, notes=(*(f"lidar: {note}" for note in notes), *sync.notes)), lidar, imu)
+    return Timing(replace(sync, notes=(*(f"lidar: {note}" for note in notes), *sync.notes)), lidar, imu, rows)
 
 
 def _placeholder(origin: int) -> Synchronisation:
@@ -149,8 +154,8 @@ def _imu_clock(inputs: Inputs, lidar: DeviceClock) -> DeviceClock:
     return clock_of(inputs.imu.stamps)[0]
 
 
-def _by_stamps(inputs: Inputs, timing: Timing) -> Synchronisation:
-    """By the camera's stamps; its shortest delay by an event or the rig's motion where they tell it."""
+def _by_stamps(inputs: Inputs, timing: Timing) -> tuple[Synchronisation, np.ndarray]:
+    """By the camera's stamps, its shortest delay by an event or the rig's motion; the frames' messages."""
     camera = inputs.camera
     if camera is None:
         raise InputError("There is no camera in the recording.")
@@ -180,7 +185,7 @@ def _by_stamps(inputs: Inputs, timing: Timing) -> Synchronisation:
         notes=(*sync.notes, match.how),
     )
     same = timing.lidar.is_computers and "in the computer's time" in " ".join(sync.notes)
-    return _delayed(sync, inputs, timing, same)
+    return _delayed(sync, inputs, timing, same), match.rows
 
 
 def _delayed(sync: Synchronisation, inputs: Inputs, timing: Timing, same: bool) -> Synchronisation:
@@ -349,5 +354,5 @@ def _pivot_of(inputs: Inputs, timing: Timing, fps: float) -> tuple[tuple[float, 
     time = timing.seconds(timing.imu, samples.time_ns, per_sample(inputs.imu, samples))
     felt = knock(time, samples.force)
     motion = np.linalg.norm(image_motion(inputs.pictures.frames(0, inputs.n_frames)), axis=1)
-    shown = knock(np.arange(len(motion)) + 0.5, motion)  # the change from one step to the next
+    shown = knock(np.arange(len(motion)) + 1.0, motion)  # so that it lies within the first step that jolts
     return (shown.time, felt.time), float(np.hypot(1e3 * felt.sd, half_frame))

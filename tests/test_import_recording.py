@@ -19,7 +19,8 @@ from acino_fte.data_tools.calibration import read_cameras
 from acino_fte.data_tools.deeplabcut import read_deeplabcut, write_deeplabcut_csv
 from acino_fte.data_tools.import_lidar import in_view
 from acino_fte.data_tools.import_recording import ImportOptions, import_recording
-from acino_fte.data_tools.import_sync import pivot_hint
+from acino_fte.data_tools.import_scan import StreamScan
+from acino_fte.data_tools.import_sync import Inputs, pivot_hint, synchronise
 from acino_fte.data_tools.lidar_camera import LidarCamera, write_lidar_camera
 from acino_fte.data_tools.load import load_sequence
 from acino_fte.data_tools.lvx_packets import LvxDevice
@@ -56,6 +57,12 @@ def attitude(t):
     nothing = np.zeros_like(yaw)
     about_z = rotation_matrix(np.column_stack([nothing, nothing, yaw]))
     return about_z @ rotation_matrix(np.column_stack([nothing, pitch, nothing]))
+
+
+def encoders(n):
+    """Zoom, focus, pan and tilt of a head of 40 000 counts a turn; tilt counts downwards."""
+    yaw, pitch = turn(np.array([n / FPS]))[0]
+    return 7, 8, round(1000 + yaw / (2 * np.pi) * 40_000), round(2000 + pitch / (2 * np.pi) * 40_000)
 
 
 def inertial():
@@ -114,7 +121,7 @@ def write_bag(path, camera=True, version=1):
         for n, pixels in zip(KEPT.tolist(), pictures(), strict=True):
             stamp, received = CAMERA_NS + round(n / FPS * 1e9), at(n / FPS, LATE_CAMERA)
             entries.append((received, "/camera/image", Picture(stamp, pixels, 500 + n)))
-            entries.append((received, "/camera/info", PictureInfo(stamp, 500 + n, 900.0, 6.0)))
+            entries.append((received, "/camera/info", PictureInfo(stamp, 500 + n, 900.0, 6.0, encoders(n))))
     with BagWriter(path, version=version) as writer:
         for received, topic, value in sorted(entries, key=lambda entry: entry[0]):
             writer.write(topic, value, received)
@@ -246,6 +253,28 @@ def test_the_camera_turns_with_the_rig(imported):
     assert imported.provenance["motion"]["route"] == "imu"
 
 
+def test_encoders_tell_how_the_camera_turned(rig, tmp_path):
+    result = command(
+        rig / "rig.bag", "-o", tmp_path / "run", "--calibration", rig / "lidar_camera.json", "--no-pictures",
+        "--motion", "encoders", "--counts-per-turn", "40000,-40000", "--encoder-zero", "1000,2000",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "by the encoders" in result.output
+    camera = read_cameras(tmp_path / "run" / "cameras.json")[0]
+    true = LIDAR_TO_CAMERA @ np.swapaxes(attitude(np.arange(N) / FPS), 1, 2)
+    trace = np.trace(np.swapaxes(camera.rotation, 1, 2) @ true, axis1=1, axis2=2)
+    error = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    assert error[KEPT].max() < 0.01
+    assert error.max() < 0.1  # dropped frames are bridged
+    refused(
+        command(
+            rig / "rig.bag", "-o", tmp_path / "no", "--calibration", rig / "lidar_camera.json",
+            "--motion", "encoders",
+        ),
+        "--counts-per-turn",
+    )  # fmt: skip
+
+
 def test_the_inertial_samples_are_in_the_clock_of_the_frames(imported):
     table = pd.read_csv(imported.folder / "imu.csv")
     assert list(table.columns) == [
@@ -314,6 +343,53 @@ def test_view_and_margin_against_the_projection():
     points = np.column_stack([x, 0 * x, z])
     assert in_view(camera, points, 0.0).tolist() == [False, True, True, True, False, False]
     assert in_view(camera, points, 2.0).tolist() == [True] * 5 + [False]
+
+
+class Shown:
+    """Pictures in memory."""
+
+    def __init__(self, frames):
+        self.all, self.stamps_ns, self.fps = frames, None, FPS
+
+    def __len__(self):
+        return len(self.all)
+
+    def frames(self, start, stop):
+        return iter(self.all[start:stop])
+
+
+def stream(kind, stamps):
+    found = StreamScan(kind, kind, "", device=stamps.tolist(), first_ns=int(stamps[0]), spread=True)
+    found.n_values = len(stamps)
+    return found
+
+
+def test_a_light_is_found_in_its_region():
+    frames = [np.full((40, 60), 90, dtype=np.uint8) for _ in range(50)]
+    for picture in frames[31:]:
+        picture[10:14, 20:24] = 240
+    lidar = stream("lidar", LIDAR_NS + np.arange(40) * 100_000_000)
+    inputs = Inputs(lidar, None, None, Shown(frames), 50, (0, 50), pivot=pivot_hint("led:19,9,6,6=2.25"))
+    sync = synchronise(inputs).sync
+    assert sync.frame_time[31] == pytest.approx(2.25 + 0.5 / FPS)
+    assert sync.sd_ms == pytest.approx(1e3 / FPS / np.sqrt(6), rel=1e-3)
+
+
+def test_a_knock_is_found_in_pictures_and_accelerations():
+    rng = np.random.default_rng(0)
+    frames = list(pictures())[:60]
+    still = frames[0]
+    frames = [np.roll(still, 4, axis=0) if n == 35 else still for n in range(60)]  # the picture jolts
+    stamps = LIDAR_NS + np.arange(800) * 5_000_000
+    force = np.array([0, 0, 9.81]) + 0.02 * rng.normal(size=(800, 3))
+    force[500:506, 0] += [6, -5, 4, -3, 2, -1]
+    imu = stream("imu", stamps)
+    imu.imu = [ImuSamples(stamps, 0 * force, force)]
+    lidar = stream("lidar", LIDAR_NS + np.arange(40) * 100_000_000)
+    inputs = Inputs(lidar, imu, None, Shown(frames), 60, (0, 60), pivot=pivot_hint("knock"))
+    sync = synchronise(inputs).sync
+    assert sync.frame_time[35] == pytest.approx(2.4975 + 0.5 / FPS, abs=1e-6)  # between frames, and samples
+    assert sync.method == "pivot"
 
 
 # --- the command ----------------------------------------------------------------------------------------
