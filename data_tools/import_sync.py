@@ -354,5 +354,5 @@ def _pivot_of(inputs: Inputs, timing: Timing, fps: float) -> tuple[tuple[float, 
     time = timing.seconds(timing.imu, samples.time_ns, per_sample(inputs.imu, samples))
     felt = knock(time, samples.force)
     motion = np.linalg.norm(image_motion(inputs.pictures.frames(0, inputs.n_frames)), axis=1)
-    shown = knock(np.arange(len(motion)) + 1.0, motion)  # so that it lies within the first step that jolts
-    return (shown.time, felt.time), float(np.hypot(1e3 * felt.sd, half_frame))
+    shown = knock((np.arange(len(motion)) + 1.0) / fps, motion)  # so that it lies within the first step
+    return (shown.time * fps, felt.time), float(np.hypot(1e3 * felt.sd, half_frame))

@@ -118,9 +118,8 @@ def knock(time: np.ndarray, force: np.ndarray) -> Event:
     step = float(np.median(np.diff(time)))
     k = int(change.argmax())
     noise = max(1.4826 * float(np.median(change)), 1e-12)
-    begun = k  # the first change of the same burst that stands out
-    while begun > 0 and time[k] - time[begun - 1] < 0.1 and change[begun - 1] > 0.3 * change[k]:
-        begun -= 1
+    burst = (time[:-1] > time[k] - 0.1) & (change > 0.3 * change[k])
+    begun = int(np.argmax(burst))  # the first change of the same burst that stands out
     far = np.abs(time[:-1] - time[k]) > max(0.5, 3 * step)
     rival = float(change[far].max()) if far.any() else 0.0
     if change[k] < 10 * noise or change[k] < 1.5 * rival:
