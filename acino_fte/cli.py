@@ -9,6 +9,7 @@ from acino_fte import (
     cli_calibrate,
     cli_compare,
     cli_histograms,
+    cli_import,
     cli_match,
     cli_motion,
     cli_run,
@@ -35,6 +36,7 @@ app.command("simulate-scene")(cli_simulate_scene.simulate_scene)
 app.command("simulate-rig")(cli_simulate_rig.simulate_rig)
 app.command("calibrate-lidar")(cli_calibrate.calibrate_lidar)
 app.command("camera-motion")(cli_motion.camera_motion)
+app.command("import-recording")(cli_import.import_recording)
 app.command("adjust")(cli_adjust.adjust)
 app.command("histograms")(cli_histograms.histograms)
 app.add_typer(cli_skeleton.app, name="skeleton")

@@ -16,13 +16,13 @@ with 0 ≤ u ≤ 1 and c held as they were when the return was attached. (The di
 substitute: with a range noise of the size of r it has no sign, and draws the animal onto its own skin.)
 
 The surface is expected at o_m, the radius of the body's capsules or a limb's usual thickness. An animal may
-be thicker or hairier than that everywhere, and each part of it again by itself:
+be hairier or thicker than that everywhere, and each part of it by itself:
 
-    s_m = o_m (1 + κ + δ_m),   κ ~ N(0, σ_κ²),   δ_m ~ N(0, σ_δ²).
+    s_m = o_m + κ + δ_m,   κ ~ N(0, σ_κ²),   δ_m ~ N(0, σ_m²).
 
-With κ integrated out, φ_m = s_m/o_m − 1 has the covariance σ_δ² I + σ_κ² 11ᵀ, which is whitened by
-(φ_m − β φ̄)/σ_δ, φ̄ the mean of the φ and β = 1 − σ_δ/√(σ_δ² + M σ_κ²). Independent priors would claim to know
-the mean of all surfaces, and with it the depth of the animal, √M times too well.
+With κ integrated out, θ = s − o has the covariance D (I + σ_κ² u uᵀ) D, D = diag(σ_m), u_m = 1/σ_m, which is
+whitened by (I − β û ûᵀ) D⁻¹ with û = u/|u| and β = 1 − (1 + σ_κ² |u|²)^(−1/2). Independent priors would claim
+to know the mean of all surfaces, and with it the depth of the animal, √M times too well.
 
 Which return belongs to what is decided by :mod:`acino_fte.association`.
 """
@@ -50,8 +50,8 @@ if TYPE_CHECKING:
 
 LIMB = 0.03
 """How far the surface lies before a joint of a limb, m."""
-COMMON, OWN = 0.3, 0.6
-"""Standard deviations of the surface as a share of what is expected: of all together, and of each."""
+COMMON, OWN = 0.01, 0.6
+"""Standard deviations of the surface: of all together, m, and of each as a share of what is expected."""
 _SOURCES = (Path(__file__), Path(terms.__file__))
 
 
@@ -144,16 +144,22 @@ def expected_surface(skeleton: Skeleton) -> np.ndarray:
     return np.where(mean > 0, mean, LIMB)
 
 
+def surface_sd(expected: np.ndarray) -> np.ndarray:
+    """Prior standard deviation of every marker's surface (M,), m, by itself and with all others."""
+    return np.hypot(OWN * expected, COMMON)
+
+
 def surface_term(parameters: Parameters) -> Term:
     """The joint prior of the surface's parameters."""
     places = parameters.of_family("surface")
-    expected, count = _origins(parameters)[places], len(places)
-    beta = 1 - OWN / np.sqrt(OWN**2 + count * COMMON**2)
-    whitening = (np.eye(count) - beta / count) / expected  # (instances, parameters)
+    own, count = OWN * _origins(parameters)[places], len(places)
+    u = 1 / own
+    beta = 1 - 1 / np.sqrt(1 + COMMON**2 * (u @ u))
+    whitening = (np.eye(count) - beta * np.outer(u, u) / (u @ u)) / own  # (instances, parameters), 1/m
     data = {f"a{i}": whitening[:, i] for i in range(count)}
-    residual = combination_residual(count, "surface", "of the expected distance")
+    residual = combination_residual(count, "surface", "of its standard deviation")
     items, numbers = np.tile(places, (count, 1)), np.arange(count)
-    frames, sd = np.zeros(count, dtype=int), np.full(count, OWN)
+    frames, sd = np.zeros(count, dtype=int), np.ones(count)
     return Term("surface", residual, frames, items, data, sd, numbers=numbers)
 
 

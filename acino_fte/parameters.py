@@ -168,11 +168,13 @@ def declare(
     return Parameters(tuple(entries))
 
 
-def with_surface(parameters: Parameters, markers: list[str], expected: np.ndarray, sd: float) -> Parameters:
-    """The same with a distance of the surface for each marker: expected (M,), m, and sd as a share of it."""
+def with_surface(
+    parameters: Parameters, markers: list[str], expected: np.ndarray, sd: np.ndarray
+) -> Parameters:
+    """The same with a distance of the surface for each marker: expected, and standard deviation (M,), m."""
     entries = [
-        Parameter("surface", marker, "", sd * float(m), _REACH_SURFACE * sd * float(m), float(m))
-        for marker, m in zip(markers, expected, strict=True)
+        Parameter("surface", marker, "", float(s), _REACH_SURFACE * float(s), float(m))
+        for marker, m, s in zip(markers, expected, sd, strict=True)
     ]
     return Parameters((*parameters.entries, *entries))
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from acino_fte import delay
-from acino_fte.depth import COMMON, OWN, DepthData, depth_terms, expected_surface, surface_term
+from acino_fte.depth import DepthData, depth_terms, expected_surface, surface_sd, surface_term
 from acino_fte.errors import InputError
 from acino_fte.kinematics import Kinematics
 from acino_fte.losses import Loss
@@ -210,8 +210,8 @@ def build_fte(
         sd = np.array([m.sd_px for m in skeleton.markers])
     parameters = _parameters(sequence, skeleton, options)
     if assumed.depth is not None and assumed.depth.surface:
-        expected, share = expected_surface(skeleton), float(np.hypot(COMMON, OWN))
-        parameters = with_surface(parameters, skeleton.marker_names, expected, share)
+        expected = expected_surface(skeleton)
+        parameters = with_surface(parameters, skeleton.marker_names, expected, surface_sd(expected))
     terms = [
         measurement_term(camera, pixels[:, c], sd, options.loss, sequence.n_frames, parameters)
         for c, camera in enumerate(sequence.cameras)
