@@ -22,20 +22,26 @@ from acino_fte.data_tools.rotations import cross_matrix, rotation_matrix
 from acino_fte.errors import InputError
 
 _BLOCK = 0.5  # s between corrections
+_SURE = 3.0  # standard deviations of noise, above which a force is one of motion
+_LASTS = 2.0  # blocks of a push, whose errors are alike
+_NEAR = 2  # blocks before and after: what moves now may have moved then
 _UP = np.array([0.0, 0.0, 1.0])
 _STATES = 9  # turn η in the world, bias of the rates, bias of the forces
 
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """What is summed once: attitudes C (K, 3, 3) from the identity, ∫C dt and ∫C f dt up to each."""
+    """What is summed once: attitudes C (K, 3, 3) from the identity, ∫C dt and ∫C f dt up to each.
+
+    Between the edges (B + 1,) lie the blocks, each with the size of its accelerations (B,), m/s².
+    """
 
     time: np.ndarray
     carried: np.ndarray
     moment: np.ndarray
     impulse: np.ndarray
     edges: np.ndarray
-    unsteady: np.ndarray
+    motion: np.ndarray
 
 
 def gravity_attitude(
@@ -94,15 +100,39 @@ def _sums(samples: ImuSamples, bias: np.ndarray, method: Method, noise: ImuNoise
     moment[1:] = np.cumsum(0.5 * (carried[1:] + carried[:-1]) * step[:, None, None], axis=0)
     impulse = np.zeros_like(force)
     impulse[1:] = np.cumsum(0.5 * (force[1:] + force[:-1]) * step[:, None], axis=0)
-    edges = np.unique(np.searchsorted(time, np.arange(0.0, time[-1] + _BLOCK, _BLOCK)).clip(0, len(time) - 1))
-    if edges[-1] != len(time) - 1:
-        edges = np.append(edges, len(time) - 1)
-    unsteady = np.array(
-        [force[a : b + 1].var(axis=0).max() for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    )
-    white = noise.force_density**2 / np.median(step)  # of a sample; what is more is motion
-    unsteady = np.sqrt(np.maximum(unsteady - 2.0 * white, 0.0))
-    return _Blocks(time, carried, moment, impulse, edges, unsteady)
+    edges = np.unique(np.searchsorted(time, np.arange(0.0, time[-1] - 0.5 * _BLOCK, _BLOCK)))
+    edges = np.append(edges, len(time) - 1)  # the last block is up to half as long again
+    motion = _motion_size(time, force, impulse, edges, noise)
+    return _Blocks(time, carried, moment, impulse, edges, motion)
+
+
+def _motion_size(
+    time: np.ndarray, force: np.ndarray, impulse: np.ndarray, edges: np.ndarray, noise: ImuNoise
+) -> np.ndarray:
+    """How large the mean acceleration in each block (B,) may be, m/s², from forces (K, 3) in one frame.
+
+    Two things tell of it: how the force varies about a straight line within a block, and how far the mean of
+    a block lies from the middle of its neighbours', each beyond what white noise makes. (Straight lines are
+    left to the gyroscope's bias, which tilts gravity steadily.) A push begins and ends, so the largest of the
+    blocks about one counts; and ``noise.sway`` is what cannot be seen.
+    """
+    first, last = edges[:-1], edges[1:]
+    mean = (impulse[last] - impulse[first]) / (time[last] - time[first])[:, None]
+    apart = np.zeros_like(mean)
+    apart[1:-1] = mean[1:-1] - 0.5 * (mean[:-2] + mean[2:])
+    most_white = 2.0 * noise.force_density**2 / np.median(np.diff(time))  # variance of a sample
+    size = np.empty(len(first))
+    for i, (a, b) in enumerate(zip(first, last, strict=True)):
+        part, n = force[a : b + 1], b + 1 - a
+        white = np.minimum(0.5 * (np.diff(part, axis=0) ** 2).mean(0), most_white)  # von Neumann 1941
+        since = time[a : b + 1] - time[a : b + 1].mean()
+        line = (since @ part) ** 2 / (since @ since) / n
+        varied = part.var(axis=0) - line - white * (1.0 + _SURE * np.sqrt(3.0 / n))
+        pushed = apart[i] ** 2 - _SURE**2 * 1.5 * white / n
+        size[i] = np.maximum(varied, 0.0).max() + np.maximum(pushed, 0.0).max()
+    near = np.pad(size, _NEAR, mode="edge")
+    largest = np.lib.stride_tricks.sliding_window_view(near, 2 * _NEAR + 1).max(1)
+    return np.sqrt(largest + noise.sway**2)
 
 
 def _start(
@@ -122,7 +152,7 @@ def _start(
     duration = max(blocks.time[b] - blocks.time[a], 1e-9)
     force = (blocks.impulse[b] - blocks.impulse[a]) / duration  # in the frame of the first sample
     start, _ = levelled(force, forward=forward)
-    other = max(rest.force_sd if rest is not None else float(blocks.unsteady[0]), 1e-4)
+    other = max(rest.force_sd if rest is not None else float(blocks.motion[0]), 1e-4)
     span = slice(a, b + 1)
     flat = np.diag([1.0, 1.0, 0.0])
     later = flat @ start @ _time_mean(blocks.moment[span], blocks.time[span] - blocks.time[a])
@@ -169,7 +199,7 @@ def _filtered(
             middle = _time_mean(turned, time)
             mean = rotation_matrix(-middle @ gyro) @ mean  # the sums do not know what was found since
             later = turned[-1] - middle
-            state, change = _corrected(state, mean, (mean_turn, later), blocks.unsteady[i], time[-1], noise)
+            state, change = _corrected(state, mean, (mean_turn, later), blocks.motion[i], time[-1], noise)
             rotation[b] = rotation_matrix(change[:3]) @ rotation[b]
             gyro, force_bias = gyro + change[3:6], force_bias + change[6:]
             covariance[b] = state[:3, :3]
@@ -208,18 +238,18 @@ def _corrected(
     state: np.ndarray,
     mean: np.ndarray,
     effects: tuple[np.ndarray, np.ndarray],
-    unsteady: float,
+    motion: float,
     time: float,
     noise: ImuNoise,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The Kalman update by the mean force of a block, in the world: mean = g z + g [z]× η̄ + R̄ b + a.
 
     The mean turn of the block is η̄ = η + (M − M̄) δb from that at its end, M = ∫R dτ; `effects` are R̄, M − M̄.
-    Accelerations a of the body are the noise; how large they are is read off the force itself: how unsteady
-    it was within the block, and how far its length is from gravity's.
+    Accelerations a of the body are the noise; how large they are is read off the force itself: `motion`, as
+    :func:`_motion_size` has it, and how far the length of the mean is from gravity's.
     """
-    moved = max(float(unsteady), abs(float(np.linalg.norm(mean)) - GRAVITY))
-    variance = noise.force_density**2 / time + moved**2
+    moved = max(_LASTS * motion**2, (float(np.linalg.norm(mean)) - GRAVITY) ** 2)
+    variance = noise.force_density**2 / time + moved
     slope = np.zeros((3, _STATES))
     level = GRAVITY * cross_matrix(_UP)
     slope[:, :3], slope[:, 3:6], slope[:, 6:] = level, level @ effects[1], effects[0]

@@ -16,6 +16,7 @@ _ABOVE_FLOOR = 2.0  # times the quietest windows that still counts as rest
 _QUIET = 0.02  # rad/s, 0.3 m/s²: above it not even the quietest window is rest
 _QUIET_FORCE = 0.3
 _TRIM = 0.25  # s, off each end of a rest beside motion, which begins softly
+_ODD = 4.0  # standard deviations of a mean rate, beyond which it is one of motion
 _BLOCK = 0.25  # s, whose means tell how slowly the noise wanders
 
 
@@ -82,7 +83,7 @@ def bias_from_rest(samples: ImuSamples, *, at_least: float = 2.0, max_bias: floa
     time = seconds(samples)
     still = _still(samples, time, max_bias)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-    spans = [_trimmed(time, int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    spans = [_trimmed(time, samples.rate, int(a), int(b)) for a, b in edges.reshape(-1, 2)]
     start, stop = max(spans, key=lambda s: time[s[1] - 1] - time[s[0]], default=(0, 1))
     duration = float(time[stop - 1] - time[start])
     if duration < at_least:
@@ -95,11 +96,24 @@ def bias_from_rest(samples: ImuSamples, *, at_least: float = 2.0, max_bias: floa
     return rest_of(samples, start, stop)
 
 
-def _trimmed(time: np.ndarray, start: int, stop: int) -> tuple[int, int]:
-    """A span without the ends that lie beside motion; at the ends of the recording nothing is taken off."""
-    first = int(np.searchsorted(time, time[start] + _TRIM)) if start > 0 else start
-    last = int(np.searchsorted(time, time[stop - 1] - _TRIM)) if stop < len(time) else stop
-    return (first, last) if last > first + 1 else (start, start + 1)
+def _trimmed(time: np.ndarray, rate: np.ndarray, start: int, stop: int) -> tuple[int, int]:
+    """A span without the ends that lie beside motion; at the ends of the recording nothing is taken off.
+
+    Motion begins softly, below the noise of a sample: a quarter second goes, and more for as long as the mean
+    rate of a quarter is not that of the middle one.
+    """
+    block = ((time[start:stop] - time[start]) / _TRIM).astype(int)
+    firsts = np.flatnonzero(np.diff(block, prepend=-1))
+    means = np.add.reduceat(rate[start:stop], firsts) / np.diff(firsts, append=stop - start)[:, None]
+    apart = np.abs(means - np.median(means, axis=0))
+    even = np.flatnonzero((apart <= _ODD * 1.4826 * np.median(apart, axis=0)).all(1))
+    edges = start + np.append(firsts, stop - start)
+    if len(even) and start > 0:
+        start = int(edges[max(even[0], 1)])
+    if len(even) and stop < len(time):
+        last = int(np.searchsorted(time, time[stop - 1] - _TRIM))
+        stop = min(last, int(edges[even[-1] + 1]))
+    return (start, stop) if stop > start + 1 else (start, start + 1)
 
 
 def rest_of(samples: ImuSamples, start: int, stop: int) -> Rest:
