@@ -4,14 +4,14 @@ A return of time t is compared to the skeleton at time t, in the camera's frame:
 interpolated, so that neither a lidar that scans for a tenth of a second nor a camera that pans smears the
 animal. On the link from a to b, the point that is nearest in the image to the return x̃ is
 
-    u = clip( (x̃/z̃ − a/z_a)·(b/z_b − a/z_a) / |b/z_b − a/z_a|², 0, 1 ),
+    v = clip( (x̃/z̃ − a/z_a)·(b/z_b − a/z_a) / |b/z_b − a/z_a|², 0, 1 ),   u = v z_a / ((1 − v) z_b + v z_a)
 
-at a lateral distance g (m, at the depth of the return), and the return lies f = z(u) − z̃ before it. A return
-is attached to the link with the least (g/σ_g)² + ((f − c s)/σ_f)², where s is the surface of that link and
-c = √(1 − (g/s)²) how much of it a round body has there, and to none when that is large: grass, bushes and a
-neighbour fail along the ray although they are near in the image. What is attached is moved to the time of its
-frame with the link. A link that lies behind another one on the same ray, such as the far shoulder behind the
-near one, is hidden by it and costs more.
+(v along the link's image, u along the link), at a lateral distance g (m, at the depth of the return), and the
+return lies f = z(u) − z̃ before it. It is attached to the link with the least (g/σ_g)² + ((f − c s)/σ_f)²,
+where s is the surface of that link and c = √(1 − (g/s)²) how much of it a round body has there, and to none
+when that is large: grass, bushes and a neighbour fail along the ray although they are near in the image. What
+is attached is moved to the time of its frame with the link. A link that lies behind another one on the same
+ray, such as the far shoulder behind the near one, is hidden by it and costs more.
 
 The thesis's way stays for comparison: the nearest return in the image of a whole scan, whatever its depth.
 Shapes: K returns, N frames, M markers, E links to draw.
@@ -292,9 +292,11 @@ def _against_links(
     seen = (xyz[:, :2] / xyz[:, 2:])[:, None]
     way = b - a
     length = np.maximum((way**2).sum(-1), 1e-18)
-    along = np.clip(((seen - a) * way).sum(-1) / length, 0.0, 1.0)
-    side = np.linalg.norm(seen - a - along[..., None] * way, axis=-1) * xyz[:, None, 2]
+    inside = np.clip(((seen - a) * way).sum(-1) / length, 0.0, 1.0)
+    side = np.linalg.norm(seen - a - inside[..., None] * way, axis=-1) * xyz[:, None, 2]
     z = then[..., 2]
+    start, end = z[:, links[:, 0]], z[:, links[:, 1]]
+    along = inside * start / ((1 - inside) * end + inside * start)
     front = (1 - along) * z[:, links[:, 0]] + along * z[:, links[:, 1]] - xyz[:, None, 2]
     return along, side, front
 
