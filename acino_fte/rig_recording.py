@@ -179,7 +179,8 @@ def _lidar_messages(simulation: RigSimulation) -> Iterator[tuple[int, LidarRetur
         return
     time = simulation.returns.time
     edges = np.arange(time[0], time[-1] + _MESSAGE, _MESSAGE)
-    at = received(simulation.options, edges[1:], "lidar") if len(edges) > 1 else np.zeros(0, dtype=np.int64)
+    ends = np.minimum(edges[1:], time[-1])  # the last message ends with the recording
+    at = received(simulation.options, ends, "lidar") if len(ends) else np.zeros(0, dtype=np.int64)
     cuts = np.searchsorted(time, edges)
     cuts[-1] = len(time)
     for i, stamp in enumerate(at.tolist()):
