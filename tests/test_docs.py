@@ -2,8 +2,8 @@
 
 The two set-up commands install, which a test must not do; ``.ci/run`` does it, and here only what follows
 ``&&`` runs. The first of them draws figures; later runs do without, to save time.
-``docs/new_species.md`` and ``docs/match_tracks.md`` have tests of their own, test_new_species_tutorial and
-test_match_tutorial.
+``docs/new_species.md``, ``match_tracks.md``, ``moving_cameras.md`` and ``lidar.md`` have tests of their own,
+test_…_tutorial.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SET_UP = [
     "pip install . && python scripts/run_fte.py examples/cheetah_gallop",
     'pip install ".[test]" && pytest',
 ]
-_NOT_HERE = {"new_species.md", "match_tracks.md", "moving_cameras.md"}  # they have tests of their own
+_NOT_HERE = {"new_species.md", "match_tracks.md", "moving_cameras.md", "lidar.md"}  # they have tests of their own
 _NO_FIGURES = ("acino-fte run ", "acino-fte match ", "acino-fte scene ")
 _KINDS = {"bash", "python", "yaml", "text"}
 _OTHERS = {"--check", "--help"}  # of ruff, of every command
