@@ -44,7 +44,7 @@ _SIZE_SD = 0.15  # how far from the species' size an animal is, and how wrong a 
 _DRIFT = 0.05  # per √s: how the error of the size changes while the animal turns
 _TOLERANCE = 0.6  # m: half the depth of an animal and its lean
 _ENOUGH = 3e-3  # relative decrease of the objective per iteration below which the start is good enough
-_ITERATIONS = 25  # a right heading is there after ten
+_ITERATIONS = 12  # a right heading is there after ten
 _SIZES = (0.6, 1.6)  # how far from the species' size an animal may be
 
 
