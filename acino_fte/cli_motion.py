@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +18,7 @@ from acino_fte.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from acino_fte.data_tools.camera_motion import CameraMotion
+    from acino_fte.data_tools.camera_motion_input import EncoderCounts
     from acino_fte.data_tools.imu import Attitude
     from acino_fte.data_tools.imu_camera import Mounting
     from acino_fte.data_tools.recording import ImuSamples
@@ -66,7 +68,8 @@ def camera_motion(
         Path,
         typer.Option(
             metavar="FILE",
-            help="Of the inertial sensor (CSV), the video (or a folder of images), or the encoders (CSV).",
+            help="Of the inertial sensor or the encoders: a CSV file or a recording (LVX, bag). Of the "
+            "pictures: a video or a folder of images.",
             show_default=False,
         ),
     ],
@@ -79,6 +82,9 @@ def camera_motion(
     start: Annotated[
         float, typer.Option(help="Time of frame 0, s from the first sample of the sensor or encoders.")
     ] = 0.0,
+    topic: Annotated[
+        str | None, typer.Option(help="Stream of a recording.", show_default="the only one of its kind")
+    ] = None,
     imu_to_camera: Annotated[
         str,
         typer.Option(
@@ -135,6 +141,14 @@ def camera_motion(
             metavar="PAN TILT", help="-1 where counts grow to the right, or down.", rich_help_panel=_ENCODERS
         ),
     ] = (1, 1),
+    encoders: Annotated[
+        tuple[int, int],
+        typer.Option(
+            metavar="PAN TILT",
+            help="Which numbers of the camera's messages they are, from 0.",
+            rich_help_panel=_ENCODERS,
+        ),
+    ] = (2, 3),
     lever: Annotated[
         tuple[float, float, float],
         typer.Option(
@@ -165,6 +179,7 @@ def camera_motion(
     """
     with reported_errors(), spinner(quiet) as tell:
         from acino_fte.data_tools.camera_motion_files import MOTION, part_of, save_motion
+        from acino_fte.data_tools.camera_motion_input import encoder_counts, inertial_samples
         from acino_fte.data_tools.load import load_sequence
         from acino_fte.result_files import check_output_folder
 
@@ -179,13 +194,13 @@ def camera_motion(
         if source is _From.video:
             motion = _from_video(sequence, name, file, model.value, tell)
         elif source is _From.encoders:
-            motion = _from_encoders(sequence, file, (counts or (0, 0), zero, sign, lever), start)
+            read = encoder_counts(file, topic, encoders, sequence.fps, start)
+            motion = _from_encoders(sequence, read, (counts or (0, 0), zero, sign, lever), start)
         else:
             units = {"rate_unit": rate_unit, "force_unit": force_unit, "time_unit": time_unit}
-            from acino_fte.data_tools.imu_table import read_imu_table
-
-            samples = read_imu_table(file, sample_rate=sample_rate, **units)
+            samples, notes = inertial_samples(file, topic, units, sample_rate)
             motion = _from_imu(sequence, name, samples, (imu_to_camera, video), method.value, start, tell)
+            motion = replace(motion, notes=notes + motion.notes)
         motion = part_of(motion, sequence.n_frames)
         tell("writing")
         note = save_motion(
@@ -258,33 +273,33 @@ def _from_video(
     """By the pictures; the animal's own keypoints are masked out."""
     from acino_fte.data_tools.odometry import visual_odometry
     from acino_fte.data_tools.odometry_features import keypoint_boxes
-    from acino_fte.data_tools.odometry_pictures import open_pictures
+    from acino_fte.data_tools.pictures import open_pictures
 
-    pictures = open_pictures(file)
     pixels = sequence.pixels(sequence.markers, 0.5)[:, sequence.cameras.names.index(name)]
     boxes = keypoint_boxes(pixels)
-    if len(pictures) > len(boxes):
-        boxes = np.concatenate([boxes, np.repeat(boxes[-1:], len(pictures) - len(boxes), axis=0)])
-    boxes = boxes[: len(pictures)]
-    return visual_odometry(pictures, sequence.cameras[name], model=model, boxes=boxes, tell=tell)
+    with open_pictures(file) as pictures:
+        boxes = boxes[np.minimum(np.arange(len(pictures)), len(boxes) - 1)]  # the last one stays
+        return visual_odometry(pictures, sequence.cameras[name], model=model, boxes=boxes, tell=tell)
 
 
-def _from_encoders(sequence: Sequence, file: Path, head: tuple[Any, ...], start: float) -> CameraMotion:
-    from acino_fte.data_tools.pan_tilt import PanTiltHead, motion_from_encoders, read_encoder_table
+def _from_encoders(
+    sequence: Sequence, read: EncoderCounts, head: tuple[Any, ...], start: float
+) -> CameraMotion:
+    from acino_fte.data_tools.pan_tilt import PanTiltHead, motion_from_encoders
 
-    counts, time, frame = read_encoder_table(file)
+    counts, time, frame = read.counts, read.time, read.frame
     turn, zero, sign, lever = head
     geometry = PanTiltHead(turn, zero, sign, lever=np.array(lever))
     n = sequence.n_frames
+    frame_time = None
     if frame is not None:
-        table = np.full((n, 2), np.nan)
+        counts, time = np.full((n, 2), np.nan), None
         inside = (frame >= 0) & (frame < n)
-        table[frame[inside]] = counts[inside]
-        return motion_from_encoders(table, geometry)
-    if time is None:
-        return motion_from_encoders(counts, geometry)
-    frame_time = np.nanmin(time) + start + np.arange(n) / sequence.fps
-    return motion_from_encoders(counts, geometry, time=time, frame_time=frame_time)
+        counts[frame[inside]] = read.counts[inside]
+    elif time is not None:
+        frame_time = np.nanmin(time) + start + np.arange(n) / sequence.fps
+    motion = motion_from_encoders(counts, geometry, time=time, frame_time=frame_time)
+    return replace(motion, notes=read.notes + motion.notes)
 
 
 def _from_imu(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acino_fte.cameras import Camera
+from acino_fte.extras import load_cv2
 from acino_fte.rig_lidar import Body
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def render_pictures(simulation: RigSimulation, width: int = 512) -> Iterator[np.
 
 def _look_up(panorama: Panorama, world: np.ndarray) -> np.ndarray:
     """Colours (K, 3) along directions (K, 3), world."""
-    cv2 = _opencv()
+    cv2 = load_cv2()
     bearing = np.arctan2(world[:, 0], world[:, 1])
     elevation = np.arcsin(np.clip(world[:, 2], -1.0, 1.0))
     x = ((bearing - panorama.left) * panorama.scale).astype(np.float32)
@@ -116,7 +117,7 @@ def make_panorama(simulation: RigSimulation, camera: Camera) -> Panorama:
 
 def _grain(rng: np.random.Generator, shape: tuple[int, int], stretch: tuple[int, int]) -> np.ndarray:
     """Noise (H, W) of several sizes, standard deviation 1; `stretch` is how much wider and higher it is."""
-    cv2 = _opencv()
+    cv2 = load_cv2()
     total = np.zeros(shape, dtype=np.float32)
     for size in (1.2, 4.0, 14.0):
         noise = rng.standard_normal(shape, dtype=np.float32)
@@ -129,7 +130,7 @@ def _plant(
     image: np.ndarray, simulation: RigSimulation, camera: Camera, rng: np.random.Generator, frame: Panorama
 ) -> None:
     """Draw the bushes, the furthest first, each with leaves of its own."""
-    cv2 = _opencv()
+    cv2 = load_cv2()
     offset = simulation.scenery.centre - camera.centre[0]
     away = np.linalg.norm(offset, axis=1)
     leaves = _grain(rng, image.shape[:2], (1, 1))
@@ -169,7 +170,7 @@ def _draw_animal(picture: np.ndarray, points: np.ndarray, body: Body, camera: Ca
 
 
 def _draw_capsule(picture: np.ndarray, ends: np.ndarray, radius: float, colour: np.ndarray) -> None:
-    cv2 = _opencv()
+    cv2 = load_cv2()
     tint = tuple(float(c) for c in colour)
     along = ends[1] - ends[0]
     length = float(np.linalg.norm(along))
@@ -181,15 +182,3 @@ def _draw_capsule(picture: np.ndarray, ends: np.ndarray, radius: float, colour: 
     for end in ends:
         x, y, r = (int(round(value * 2**_SHIFT)) for value in (*end, radius))
         cv2.circle(picture, (x, y), max(r, 1), tint, -1, cv2.LINE_AA, _SHIFT)
-
-
-def _opencv():
-    from acino_fte.errors import InputError
-
-    try:
-        import cv2
-    except ImportError:
-        raise InputError(
-            "Pictures need OpenCV, which is not installed.", remedy='pip install "acino-fte[lidar]"'
-        ) from None
-    return cv2

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from acino_fte.errors import InputError
+from acino_fte.extras import missing_package
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 """Kinds of fields, as ``rosbags`` numbers them."""
@@ -70,15 +70,6 @@ CUSTOM = Layout("custom", False, "Q", False, 0)
 LAYOUTS = {layout.name: layout for layout in (ROS1, CDR, CUSTOM)}
 
 
-def rosbags_missing(error: ImportError) -> InputError:
-    """The error to raise where a package of the extra ``lidar`` is not installed."""
-    return InputError(
-        "Reading bags needs a package that is not installed.",
-        found=str(error),
-        remedy='pip install "acino-fte[lidar]"',
-    )
-
-
 @lru_cache(maxsize=256)
 def definitions(name: str, text: str, version: int, encoding: str = "ros2msg") -> Types:
     """Fields of a message type and of all types in it.
@@ -123,7 +114,7 @@ def _standard(version: int) -> Types:
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise rosbags_missing(error) from error
+        raise missing_package("Bags", error) from error
     store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
     return {name: fields for name, (_, fields) in store.fielddefs.items()}
 

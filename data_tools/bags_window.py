@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-from acino_fte.data_tools.bags_serial import Layout, rosbags_missing
+from acino_fte.data_tools.bags_serial import Layout
 from acino_fte.data_tools.recording import Damage
+from acino_fte.extras import missing_package
 
 _BLOCK = 1 << 18
 _MOST_READ = 1 << 22  # a damaged length may ask for more than there is
@@ -281,7 +282,7 @@ def decompressor(name: str) -> Any:
 
             return _Named(name, zstandard.ZstdDecompressor().decompressobj())
     except ImportError as error:
-        raise rosbags_missing(error) from error
+        raise missing_package("Compressed bags", error) from error
     raise ValueError(f"the compression '{name}' is not known")
 
 

@@ -6,10 +6,11 @@ import shutil
 from pathlib import Path
 from typing import Any, Literal
 
-from acino_fte.data_tools.bags_serial import CDR, CUSTOM, ROS1, definitions, encode, rosbags_missing
+from acino_fte.data_tools.bags_serial import CDR, CUSTOM, ROS1, definitions, encode
 from acino_fte.data_tools.recording import ImuSamples, LidarReturns, Picture, PictureInfo
 from acino_fte.data_tools.ros_messages import DEFINITIONS, to_message
 from acino_fte.errors import InputError
+from acino_fte.extras import missing_package
 
 _COMPRESSIONS = {1: (None, "bz2", "lz4"), 2: (None, "zstd")}
 
@@ -68,7 +69,7 @@ class BagWriter:
             from rosbags import rosbag1, rosbag2
             from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError as error:
-            raise rosbags_missing(error) from error
+            raise missing_package("Bags", error) from error
         self._store = get_typestore(Stores.ROS1_NOETIC if self.version == 1 else Stores.ROS2_HUMBLE)
         for name, text in DEFINITIONS.items():
             self._store.register(get_types_from_msg(text, name))

@@ -14,6 +14,7 @@ import numpy as np
 
 from acino_fte.data_tools.clouds_tables import Columns, binary_rows, text_rows
 from acino_fte.errors import InputError
+from acino_fte.extras import missing_package
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 _WAYS = ("ascii", "binary", "binary_compressed")
@@ -149,11 +150,7 @@ def _lzf() -> Any:
     try:
         import lzf
     except ImportError as error:
-        raise InputError(
-            "Packed PCD files need a package that is not installed.",
-            found=str(error),
-            remedy='pip install "acino-fte[lidar]"',
-        ) from error
+        raise missing_package("Packed PCD files", error) from error
     return lzf
 
 
@@ -199,11 +196,7 @@ def write_pcd(file: BinaryIO, columns: dict[str, np.ndarray], way: str) -> None:
     try:
         from pypcd4 import Encoding, PointCloud
     except ImportError as error:
-        raise InputError(
-            "Writing PCD files needs a package that is not installed.",
-            found=str(error),
-            remedy='pip install "acino-fte[lidar]", or write a PLY file',
-        ) from error
+        raise missing_package("PCD files", error, instead=", or write a PLY file") from error
     fields = tuple(columns)
     types = tuple(column.dtype.type for column in columns.values())
     PointCloud.from_points(tuple(columns.values()), fields, types).save(file, Encoding(way))

@@ -52,13 +52,13 @@ def is_lvx(data: bytes) -> bool:
     return data.startswith(_NAME)
 
 
-def read_head(file: BinaryIO, path: Path) -> LvxHead:
+def read_head(file: BinaryIO, path: Path, search: int = _SEARCH_BYTES) -> LvxHead:
     """Read the head of an LVX file; a wrong one is passed over where frames follow it.
 
     Raises
     ------
     InputError
-        The file is no LVX: neither its head nor anything in its first 64 MB says so.
+        The file is no LVX: neither its head nor anything in its first `search` bytes says so.
     """
     file.seek(0)
     data = file.read(_HEAD_BYTES)
@@ -74,7 +74,7 @@ def read_head(file: BinaryIO, path: Path) -> LvxHead:
         return _head(data, named, named, signed)
     if signed and len(data) < PUBLIC.itemsize:
         return LvxHead(LAYOUTS["1.1"], (), len(data), cut=True)
-    return _found(file, path, named, signed, data)
+    return _found(file, path, named, signed, data, search)
 
 
 def _score(data: bytes, layout: Layout) -> int:
@@ -139,11 +139,13 @@ def _devices(data: bytes, layout: Layout, count: int) -> tuple[tuple[LvxDevice, 
     return tuple(devices), numbers
 
 
-def _found(file: BinaryIO, path: Path, named: Layout | None, signed: bool, data: bytes) -> LvxHead:
+def _found(
+    file: BinaryIO, path: Path, named: Layout | None, signed: bool, data: bytes, search: int
+) -> LvxHead:
     """The head of a file whose head is unusable: its version is that of the first frame found."""
     skipped: dict[Version, tuple[int, int]] = {}
     for version, layout in LAYOUTS.items():
-        place = Walk(file, PackageTest(layout), 0).find_frame(_SEARCH_BYTES)
+        place = Walk(file, PackageTest(layout), 0).find_frame(search)
         if place is not None:
             skipped[version] = _skipped(file, layout, place), place
     if skipped:

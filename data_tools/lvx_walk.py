@@ -125,7 +125,7 @@ class Walk:
         pos = self._start
         self._file.seek(pos)
         while pos < self._start + limit:
-            pos = self._resync(pos)
+            pos = self._resync(pos, self._start + limit)
             at = pos - self._base
             if at >= len(self._data):
                 return None
@@ -236,8 +236,10 @@ class Walk:
             return True
         return self._chain(at + size, 2, self._index, crumbs=False)
 
-    def _resync(self, pos: int) -> int:
-        """The next place from `pos` on where the walk can go on; the end of the file if there is none."""
+    def _resync(self, pos: int, limit: int | None = None) -> int:
+        """The next place from `pos` on where the walk can go on; without any the end of the file, or a place
+        behind `limit`.
+        """
         while True:
             self._reach(pos)
             start = pos - self._base
@@ -247,7 +249,7 @@ class Walk:
                 if self._confirmed(at):
                     return self._base + at
             pos = self._base + stop
-            if self._ended:
+            if self._ended or (limit is not None and pos >= limit):
                 return pos
 
     def _marks(self, start: int, stop: int) -> np.ndarray:

@@ -9,7 +9,7 @@ known, and is bridged.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,8 +19,6 @@ from acino_fte.cameras import Camera
 from acino_fte.data_tools.camera_motion import CameraMotion, bridged
 from acino_fte.data_tools.odometry_features import (
     Features,
-    PictureList,
-    Pictures,
     find_features,
     match_features,
 )
@@ -31,6 +29,7 @@ from acino_fte.data_tools.odometry_pairs import (
     turn_between,
 )
 from acino_fte.data_tools.odometry_steps import Depths, carried_depths, step_length
+from acino_fte.data_tools.pictures import NumberedPictures, PictureList
 from acino_fte.errors import InputError
 
 Model = Literal["auto", "full", "rotation"]
@@ -94,7 +93,7 @@ class _Chain:
 class _Follower:
     """Features of pictures, as they are asked for, and motions between two of them."""
 
-    pictures: Pictures
+    pictures: NumberedPictures
     camera: Camera
     boxes: np.ndarray | None
     options: OdometryOptions
@@ -122,7 +121,7 @@ class _Follower:
 
 
 def visual_odometry(
-    pictures: Pictures | Any,
+    pictures: NumberedPictures | Sequence[Any],
     camera: Camera,
     *,
     model: Model = "auto",
@@ -134,8 +133,9 @@ def visual_odometry(
 
     Parameters
     ----------
-    pictures : Pictures, or a list of arrays
-        Anything with ``len()`` and ``.at(n) -> Picture``, or arrays (H, W) or (H, W, 3).
+    pictures : NumberedPictures, or a list of arrays
+        Anything with ``len()`` and ``.at(n) -> Picture``, or arrays (H, W) or (H, W, 3); as large as the
+        camera's, or smaller ones of the same shape.
     camera : Camera
         Its lens.
     model : {"auto", "full", "rotation"}
@@ -158,14 +158,13 @@ def visual_odometry(
     Raises
     ------
     InputError
-        There are fewer than two pictures, the boxes are not one set a picture, or the lens is no pinhole or
-        fisheye.
+        There are fewer than two pictures, or of another shape than the camera's; the boxes are not one set a
+        picture; or the lens is no pinhole or fisheye.
     """
     options = options or OdometryOptions()
     tell = tell or (lambda _: None)
-    if not hasattr(pictures, "at"):
-        pictures = PictureList(pictures)
-    follower = _follower(pictures, camera, boxes, options)
+    shown = pictures if hasattr(pictures, "at") else PictureList(pictures)
+    follower = _follower(shown, camera, boxes, options)
     notes: list[str] = []
     numbers: dict[str, Any] = {}
     if model == "auto":
@@ -175,11 +174,11 @@ def visual_odometry(
         raise InputError("This model of a motion is not known.", expected=", ".join(MODELS), found=str(model))
     numbers["model"] = model
     chains = _turned(follower, tell) if model == "rotation" else _stepped(follower, tell, notes)
-    return _joined(chains, len(pictures), model, notes, numbers)
+    return _joined(chains, len(shown), model, notes, numbers)
 
 
 def _follower(
-    pictures: Pictures, camera: Camera, boxes: np.ndarray | None, options: OdometryOptions
+    pictures: NumberedPictures, camera: Camera, boxes: np.ndarray | None, options: OdometryOptions
 ) -> _Follower:
     n = len(pictures)
     if n < 2:
@@ -197,10 +196,25 @@ def _follower(
                 expected=f"({n}, 4): left, top, right, bottom of each picture, px",
                 found=f"shape {boxes.shape}",
             )
-    size = max(pictures.at(0).pixels.shape[:2])
-    shrunk = max(size / options.longest_side, 1.0)
+    size = pictures.at(0).pixels.shape[:2]
+    whole = _whole(size, camera)
+    shrunk = whole * max(max(size) / options.longest_side, 1.0)
     threshold = options.threshold_px * shrunk / float(camera.matrix[0, 0])
     return _Follower(pictures, camera, boxes, options, threshold, {})
+
+
+def _whole(size: tuple[int, ...], camera: Camera) -> float:
+    """How many pixels of the camera one of a picture (height, width) is across."""
+    width, height = camera.resolution
+    whole = width / size[1]
+    if abs(height - size[0] * whole) > 2.0 * whole:  # codecs take even sizes
+        raise InputError(
+            "The pictures are not of this camera.",
+            expected=f"{width} × {height} px, or smaller ones of the same shape",
+            found=f"{size[1]} × {size[0]} px",
+            remedy="take the video that belongs to the camera file, neither cut nor turned",
+        )
+    return whole
 
 
 def _views(

@@ -3,37 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 
 from acino_fte.cameras import Camera
-from acino_fte.data_tools.recording import Picture
-from acino_fte.errors import InputError
-
-
-class Pictures(Protocol):
-    """Pictures by number: a reader of a video, a folder, or :class:`PictureList`."""
-
-    def __len__(self) -> int: ...
-
-    def at(self, n: int) -> Picture:
-        """Picture number n."""
-
-
-class PictureList:
-    """Pictures that are in memory already: arrays (H, W) or (H, W, 3), or :class:`Picture`."""
-
-    def __init__(self, pictures: Any) -> None:
-        self._pictures = pictures
-
-    def __len__(self) -> int:
-        return len(self._pictures)
-
-    def at(self, n: int) -> Picture:
-        """Picture number n."""
-        picture = self._pictures[n]
-        return picture if isinstance(picture, Picture) else Picture(n, np.asarray(picture))
+from acino_fte.extras import load_cv2
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,18 +29,6 @@ class Features:
         return len(self.bearing)
 
 
-def imported_cv2() -> Any:
-    """OpenCV, or a message that says how to get it."""
-    try:
-        import cv2
-    except ImportError:
-        raise InputError(
-            "Pictures cannot be followed: OpenCV is not installed.",
-            remedy='pip install "acino-fte[lidar]"',
-        ) from None
-    return cv2
-
-
 def find_features(
     pixels: np.ndarray, camera: Camera, boxes: np.ndarray | None, *, most: int, longest_side: int
 ) -> Features:
@@ -76,28 +38,29 @@ def find_features(
     Parameters
     ----------
     pixels : (H, W) or (H, W, 3)
-        Grey, or red, green, blue.
+        Grey, or red, green, blue; as wide as the camera's pictures, or narrower with the same field of view.
     camera : Camera
         Its lens takes the distortion away; features outside its valid field are left out.
     boxes : (B, 4), optional
-        Left, top, right, bottom, px, of what moves by itself; NaN for none.
+        Left, top, right, bottom, px of the camera, of what moves by itself; NaN for none.
     most : int
         Features at most.
     longest_side : int
         Larger pictures are made smaller before, px.
     """
-    cv2 = imported_cv2()
+    cv2 = load_cv2()
     grey = _grey(pixels)
     share = min(1.0, longest_side / max(grey.shape))
     if share < 1.0:
         grey = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-    mask = _mask(grey.shape, boxes, share)
+    whole = camera.resolution[0] / pixels.shape[1]
+    mask = _mask(grey.shape, boxes, share / whole)
     detector = cv2.SIFT_create(nfeatures=most, contrastThreshold=0.02)
     points, descriptor = detector.detectAndCompute(grey, mask)
     if descriptor is None or not len(points):
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     factor = np.array(pixels.shape[1::-1]) / np.array(grey.shape[::-1])
-    place = (np.array([p.pt for p in points]) + 0.5) * factor - 0.5
+    place = (np.array([p.pt for p in points]) + 0.5) * (factor * whole) - 0.5
     bearing = camera.undistort(place)
     descriptor = np.sqrt(descriptor / np.maximum(descriptor.sum(1, keepdims=True), 1e-9))
     seen = np.isfinite(bearing).all(1)
@@ -106,11 +69,12 @@ def find_features(
 
 def _grey(pixels: np.ndarray) -> np.ndarray:
     """The picture as grey uint8; deep pictures are stretched to what they hold."""
+    deep = pixels.dtype == np.uint16
     if pixels.ndim == 3:
         pixels = pixels.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
     if pixels.dtype == np.uint8:
         return np.ascontiguousarray(pixels)
-    if pixels.dtype == np.uint16:
+    if deep:
         top = max(float(np.percentile(pixels, 99.9)), 1.0)
         pixels = pixels * (255.0 / top)
     return np.clip(np.rint(pixels), 0, 255).astype(np.uint8)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from acino_fte.data_tools.odometry_features import imported_cv2
 from acino_fte.data_tools.rotations import rotation_matrix
+from acino_fte.extras import load_cv2
 
 LEAST_POINTS = 20
 _HYPOTHESES = 300
@@ -203,7 +203,7 @@ def _frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _sampled_step(
     a: np.ndarray, b: np.ndarray, threshold: float, way: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    cv2 = imported_cv2()
+    cv2 = load_cv2()
     try:
         essential, mask = cv2.findEssentialMat(
             a, b, np.eye(3), method=getattr(cv2, way), prob=0.9999, threshold=threshold

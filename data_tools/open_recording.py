@@ -13,6 +13,7 @@ _EXPECTED = "LVX or LVX2, a ROS 1 bag, a ROS 2 bag (folder, .db3, .mcap), eCAL's
 _SUFFIXES = (".lvx", ".lvx2", ".bag", ".db3", ".mcap", ".mp4", ".mkv", ".avi", ".mov")
 _LVX = b"livox_tech"
 _LVX_NUMBER = bytes.fromhex("67a70eac")
+_SEARCH = 4 << 20  # bytes in which frames without a head have to begin
 RecordingKind = Literal["lvx", "bag", "video"]
 
 
@@ -77,11 +78,13 @@ def recording_kind(path: Path | str) -> RecordingKind:
         return "bag"
     if _is_video(head):
         return "video"
+    if _known(head) is None and _has_frames(path):
+        return "lvx"
     raise InputError(
         "The file is no recording that can be read.",
         file=path,
         expected=_EXPECTED,
-        found=_what(head),
+        found=_known(head) or f"unknown bytes: {head[:8].hex(' ')}",
         remedy=_near(path),
     )
 
@@ -114,8 +117,20 @@ def _is_video(head: bytes) -> bool:
     )
 
 
-def _what(head: bytes) -> str:
-    """What some first bytes are, in words."""
+def _has_frames(path: Path) -> bool:
+    """Whether frames of a lidar follow in a file whose head is lost."""
+    from acino_fte.data_tools.lvx_head import open_binary, read_head
+
+    with open_binary(path) as file:
+        try:
+            read_head(file, path, _SEARCH)
+        except InputError:
+            return False
+    return True
+
+
+def _known(head: bytes) -> str | None:
+    """What some first bytes are that are surely no recording, in words; None of others."""
     for start, name in (
         (b"\x89PNG", "a PNG image"),
         (b"\xff\xd8\xff", "a JPEG image"),
@@ -135,7 +150,7 @@ def _what(head: bytes) -> str:
             return f"text: {text.split(chr(10))[0][:40]!r}"
         except UnicodeDecodeError:
             pass
-    return f"unknown bytes: {head[:8].hex(' ')}"
+    return None
 
 
 def _near(path: Path) -> str | None:

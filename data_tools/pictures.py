@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from acino_fte.data_tools.recording import Picture
-from acino_fte.data_tools.ros_images import load_cv2
 from acino_fte.data_tools.video import VIDEO_SUFFIXES, VideoReader
 from acino_fte.errors import InputError
+from acino_fte.extras import load_cv2
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
-class Pictures(Protocol):
-    """What pages and odometry ask of pictures."""
-
-    @property
-    def fps(self) -> float | None:
-        """Frames per second; None where nothing says it."""
+class NumberedPictures(Protocol):
+    """What odometry asks of pictures."""
 
     def __len__(self) -> int: ...
 
     def at(self, frame: int) -> Picture:
         """The picture of this number, from 0."""
+
+
+class Pictures(NumberedPictures, Protocol):
+    """Pictures of a file or folder."""
+
+    @property
+    def fps(self) -> float | None:
+        """Frames per second; None where nothing says it."""
 
     def close(self) -> None:
         """Close the files."""
@@ -57,13 +62,34 @@ def open_pictures(path: Path | str, fps: float | None = None) -> Pictures:
     if path.suffix.lower() in IMAGE_SUFFIXES:
         return PictureFolder(path, fps)
     if not path.exists():
-        raise InputError("There are no such pictures.", file=path, expected="a video or a folder of images")
+        raise InputError(
+            "There are no such pictures.",
+            file=path,
+            expected="a video or a folder of images",
+            found="nothing",
+            remedy="check the path",
+        )
     return VideoReader(path)
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
     """A key to sort by that takes digits as numbers."""
     return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in re.split(r"(\d+)", name.lower()) if p]
+
+
+class PictureList:
+    """Pictures in memory as :class:`NumberedPictures`: arrays (H, W) or (H, W, 3), or :class:`Picture`."""
+
+    def __init__(self, pictures: Sequence[Any]) -> None:
+        self._pictures = pictures
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def at(self, frame: int) -> Picture:
+        """The picture of this number, from 0."""
+        picture = self._pictures[frame]
+        return picture if isinstance(picture, Picture) else Picture(frame, np.asarray(picture))
 
 
 class PictureFolder:

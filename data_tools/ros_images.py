@@ -6,26 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from acino_fte.errors import InputError
+from acino_fte.extras import load_cv2
 
 # ROS names a mosaic by its first two pixels of the first and the second row; OpenCV's older names begin at
 # the second row and the second column.
 _BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
 _CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3}
 _CHANNELS |= {"rgba8": 4, "bgra8": 4, "8UC4": 4, "rgb16": 3, "bgr16": 3}
-
-
-def load_cv2() -> Any:
-    """OpenCV, or an error that names the remedy."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise InputError(
-            "Images need a package that is not installed.",
-            found=str(error),
-            remedy='pip install "acino-fte[lidar]"',
-        ) from error
-    return cv2
 
 
 def picture_from_image(message: dict[str, Any]) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from acino_fte.data_tools.recording import Damage, Kind, Picture, Record, Stream
 from acino_fte.data_tools.video_cut import is_cut
 from acino_fte.errors import InputError
+from acino_fte.extras import missing_package
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".m4v", ".webm", ".mpg", ".mpeg", ".mts", ".ts", ".wmv")
 _CACHE_BYTES = 64 << 20  # of decoded frames about the last one asked for
@@ -27,11 +28,7 @@ def load_av() -> Any:
         import av
         import av.error
     except ImportError as error:
-        raise InputError(
-            "Videos need a package that is not installed.",
-            found=str(error),
-            remedy='pip install "acino-fte[lidar]"',
-        ) from error
+        raise missing_package("Videos", error) from error
     av.logging.set_level(None)  # damage is reported by the reader, not on the terminal
     return av
 

@@ -15,6 +15,10 @@ from test_odometry import LENS, pan, panned
 from acino_fte.cameras import CameraArray
 from acino_fte.cli_motion import camera_motion
 from acino_fte.data_tools.calibration import read_cameras, write_cameras
+from acino_fte.data_tools.imu_table import read_imu_table
+from acino_fte.data_tools.lvx_packets import LvxDevice
+from acino_fte.data_tools.lvx_write import write_lvx
+from acino_fte.data_tools.recording import ImuSamples, PictureInfo
 from acino_fte.data_tools.rotations import rotation_vector
 
 APP = typer.Typer()
@@ -108,13 +112,72 @@ def test_by_the_inertial_sensor(recording, tmp_path):
     assert note["levelled"] and note["known"] == N
 
 
+@pytest.fixture(scope="module")
+def bag(recording):
+    """A ROS 1 bag with the samples of the table, and messages of a camera that dropped its frame 4."""
+    pytest.importorskip("rosbags")
+    from acino_fte.data_tools.bags_write import BagWriter
+
+    _, rig, _ = recording
+    table = read_imu_table(rig / "imu.csv")
+    path = rig / "a recording ü.bag"
+    with BagWriter(path, version=1) as writer:
+        for k, stamp in enumerate(table.time_ns.tolist()):
+            one = ImuSamples(table.time_ns[k : k + 1] + 10**9, table.rate[k : k + 1], table.force[k : k + 1])
+            writer.write("/livox/imu", one, stamp + 10**9)
+        for n in (0, 1, 2, 3, 5, 6, 7):
+            stamp = round((4 + n / FPS) * 1e9)
+            info = PictureInfo(stamp, 70 + n, 900.0, 6.0, (0, 0, 100 * n, 50 * n))
+            writer.write("/camera/info", info, stamp)
+    return path
+
+
+def test_a_recording_in_place_of_a_table(recording, bag, tmp_path):
+    """Of the same samples and counts the same poses, by a bag and by the lidar's own file."""
+    folder, rig, _ = recording
+    given = "--imu-to-camera", rig / "mount.json", "--start", 3
+    lvx = tmp_path / "no suffix"
+    samples = read_imu_table(rig / "imu.csv")
+    write_lvx(lvx, [LvxDevice(0, "3GGDSIM00100091", 2)], [{"imu0": samples}])
+    cameras = []
+    for name, file in (("csv", rig / "imu.csv"), ("bag", bag), ("lvx", lvx)):
+        result = run(folder, "--from", "imu", "--file", file, *given, "-o", tmp_path / name)
+        assert result.exit_code == 0, result.output
+        cameras.append(read(tmp_path / name)[0].rotation)
+    np.testing.assert_allclose(cameras[1], cameras[0], atol=1e-9)
+    np.testing.assert_allclose(cameras[2], cameras[0], atol=1e-5)  # the file has single precision
+    counts = "--counts", 4096, 4096
+    for name, file in (("table", rig / "encoders.csv"), ("messages", bag)):
+        result = run(folder, "--from", "encoders", "--file", file, *counts, "-o", tmp_path / name)
+        assert result.exit_code == 0, result.output
+    (table, _), (messages, note) = read(tmp_path / "table"), read(tmp_path / "messages")
+    assert note["known"] == N - 1 and note["unknown_frames"] == [4]  # it was dropped: bridged
+    rows = np.delete(np.arange(N), 4)
+    np.testing.assert_allclose(messages.rotation[rows], table.rotation[rows], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("--from", "imu", "--imu-to-camera", "same", "--topic", "/livox/imus"), "did you mean '/livox/imu'"),
+        (("--from", "encoders", "--counts", "4", "4", "--encoders", "3", "4"), "4 numbers in the first"),
+        (("--from", "encoders", "--counts", "4", "4", "--encoders", "-1", "3"), "no such encoders"),
+        (("--from", "video"), "The video cannot be read"),
+    ],
+)
+def test_faults_of_a_recording(recording, bag, tmp_path, arguments, word):
+    result = run(recording[0], *arguments, "--file", bag, "-o", tmp_path / "out")
+    assert result.exit_code == 2 and word in result.output, result.output
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
         (("--from", "encoders", "--file", "encoders.csv"), "--counts"),
         (("--from", "imu", "--file", "imu.csv"), "--imu-to-camera"),
         (("--from", "imu", "--file", "imu.csv", "--imu-to-camera", "no.json"), "mounting of the sensor"),
-        (("--from", "video", "--file", "no.mp4"), "does not exist"),
+        (("--from", "video", "--file", "no.mp4"), "no such pictures"),
         (("--from", "video", "--file", "images", "--camera", "d"), "no such camera"),
         (
             ("--from", "imu", "--file", "imu.csv", "--imu-to-camera", "same", "--start", "99"),

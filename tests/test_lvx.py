@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from acino_fte.data_tools.lvx import LvxReader
 from acino_fte.data_tools.lvx_packets import LAYOUTS, LvxDevice, decode_stamps, encode_stamps
 from acino_fte.data_tools.lvx_write import LvxWriter, write_lvx
+from acino_fte.data_tools.open_recording import recording_kind
 from acino_fte.data_tools.recording import GRAVITY, ImuSamples, LidarReturns
 from acino_fte.errors import InputError
 
@@ -266,6 +267,8 @@ def test_a_bad_head_with_good_frames(tmp_path, version, how):
     assert reader.version == version and reader.damage.whole and reader.notes
     assert ("magic" in reader.notes[0]) == (how == "magic")
     assert reader.devices[0].type == (2 if how == "magic" else None)
+    nameless = path.rename(tmp_path / "a recording.bin")
+    assert recording_kind(nameless) == "lvx"
 
 
 def test_frames_of_another_version_than_the_head_says(tmp_path):

@@ -100,6 +100,23 @@ def test_a_pan_is_followed(panning, found):
     assert nees.mean() < 4  # features of rendered pictures err together, so it is more than one
 
 
+def test_smaller_pictures_of_the_same_view(panning):
+    """The camera file is of 640 × 480 px, the pictures are of half that."""
+    large = np.diag([2.0, 2.0, 1.0]) @ K
+    large[:2, 2] += 0.5  # centres of pixels are at integers
+    lens = Camera("c", "pinhole", large, np.zeros(0), np.eye(3), np.zeros(3), (640, 480))
+    found = visual_odometry(panning[0][:3], lens, model="rotation", options=QUICK)
+    assert degrees(found.rotation, panning[1][:3] @ panning[1][0].T).max() < 0.03
+    with pytest.raises(InputError, match="not of this camera"):
+        visual_odometry([p[:200] for p in panning[0]], lens, options=QUICK)
+
+
+def test_deep_colours(panning):
+    deep = [np.repeat(p[..., None], 3, axis=2).astype(np.uint16) * 200 for p in panning[0][:3]]
+    found = visual_odometry(deep, LENS, model="rotation", options=QUICK)
+    assert degrees(found.rotation, panning[1][:3] @ panning[1][0].T).max() < 0.03
+
+
 def test_uncertainty_of_turns_and_steps():
     """Over many pairs of pictures, errors are as large as their covariance says; outliers are found."""
     turns, steps, ways = [], [], []
