@@ -108,32 +108,47 @@ class ChainFactor:
         length = self._pieces.length[chosen]
         last = self._pieces.start[chosen] + length - 1
         active = np.searchsorted(-length, -np.arange(length.max(initial=0)), side="left")
-        steps = np.repeat(np.arange(len(active)), active)
-        nodes = last[np.arange(len(steps)) - np.repeat(np.cumsum(active) - active, active)] - steps
+        begin = np.cumsum(active) - active
+        back = np.repeat(np.arange(len(active)), active)
+        piece = np.arange(len(back)) - np.repeat(begin, active)
+        nodes = last[piece] - back
         c, own = self._columns(nodes)
-        window = np.zeros((len(chosen), _NEXT, _NEXT))
-        begin = 0
-        later, now = self._coefficients[2::-1], self._coefficients[3]
-        pattern = np.kron(np.outer(later, later), np.eye(3))
-        beside = 2 * now * np.kron(later[:, None], np.eye(3))
-        for back, count in enumerate(active):
-            at = slice(begin, begin + count)
-            begin += count
-            w = window[:count]
-            cross = -(w @ c[at])  # Σ_(N,t)
-            block = own[at] - c[at].transpose(0, 2, 1) @ cross
-            block = 0.5 * (block + block.transpose(0, 2, 1))  # or rounding grows without bound
-            out[nodes[at]] = block
-            if back >= N_LAGS and np.isfinite(self._tails):
-                total = now**2 * np.trace(block, axis1=1, axis2=2)
-                total += cross.reshape(count, -1) @ beside.ravel() + w.reshape(count, -1) @ pattern.ravel()
-                spread[nodes[at] + N_LAGS] = total
-            shifted = np.empty_like(w)
-            shifted[:, 3:, 3:] = w[:, :-3, :-3]
-            shifted[:, :3, :3] = block
-            shifted[:, 3:, :3] = cross[:, :-3]
-            shifted[:, :3, 3:] = cross[:, :-3].transpose(0, 2, 1)
-            window = shifted
+        c, own = -c, 0.5 * own
+        half = 0.5 * c.transpose(0, 2, 1)
+        cross, block = np.empty_like(c), np.empty_like(own)  # Σ_(N,t), Σ_tt
+        window, shifted = np.zeros((2, len(chosen), _NEXT, _NEXT))
+        for first, count in zip(begin.tolist(), active.tolist(), strict=True):  # few rows: mind every call
+            at = slice(first, first + count)
+            w, x = window[:count], shifted[:count]
+            beside = np.matmul(w, c[at], out=cross[at])
+            part = half[at] @ beside
+            part += own[at]
+            part = np.add(part, part.transpose(0, 2, 1), out=block[at])  # or rounding grows without bound
+            x[:, 3:, 3:] = w[:, :-3, :-3]
+            x[:, :3, :3] = part
+            x[:, 3:, :3] = beside[:, :-3]
+            x[:, :3, 3:] = beside[:, :-3].transpose(0, 2, 1)
+            window, shifted = shifted, window
+        out[nodes] = block
+        if np.isfinite(self._tails):
+            fourth = back >= N_LAGS
+            here = (
+                begin[back[fourth] - np.arange(N_LAGS + 1)[:, None]] + piece[fourth]
+            )  # t, t + 1, t + 2, t + 3
+            spread[nodes[fourth] + N_LAGS] = self._innovation(here, block, cross)
+
+    def _innovation(self, here: np.ndarray, block: np.ndarray, cross: np.ndarray) -> np.ndarray:
+        """Variance (K,) of the innovations of four frames each, whose rows are (4, K), sum of the axes."""
+        trace = np.concatenate(
+            [np.trace(block, axis1=1, axis2=2)[None], np.einsum("klaa->lk", cross.reshape(-1, N_LAGS, 3, 3))]
+        )
+        factors = self._coefficients[::-1]  # of t, t + 1, t + 2, t + 3
+        total = np.zeros(here.shape[1])
+        for i, first in enumerate(factors):
+            total += first**2 * trace[0, here[i]]
+            for lag, second in enumerate(factors[i + 1 :], 1):
+                total += 2 * first * second * trace[lag, here[i]]
+        return total
 
 
 def _cholesky(band: np.ndarray) -> np.ndarray:

@@ -23,18 +23,28 @@ from acino_fte.terms import measurement_term
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
 
-# Files that take a minute or so, longest first: begun last, they would keep one process waiting.
+# Files that take longest (10 s and more), longest first: begun last, they would keep one process waiting.
 LONGEST = (
     "test_lily",
-    "test_lily_ladder",
     "test_docs",
-    "test_scene_reaches",
     "test_calibration",
     "test_run_cli",
+    "test_scene_reaches",
+    "test_matching_reaches",
     "test_plots",
     "test_recovery",
+    "test_diagnosis",
+    "test_explicit",
+    "test_condensed",
+    "test_assignments",
+    "test_match_cli",
+    "test_odometry",
+    "test_compare_cli",
     "test_scene_tutorial",
-    "test_time_offsets",
+    "test_calibrate_page",
+    "test_adjust_page",
+    "test_lidar_solve_reaches",
+    "test_bags_damage",
 )
 
 
