@@ -19,53 +19,27 @@ Shapes: K returns, N frames, M markers, E links to draw.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import fields, replace
 
 import numpy as np
 
+from acino_fte.attaching import Attached, attach, on_link
 from acino_fte.cameras import Camera
 from acino_fte.depth import BodyReturns, DepthData, MarkerDepths
 from acino_fte.errors import InputError
 from acino_fte.lidar import Lidar
+from acino_fte.prediction import positions_at
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton
 
 ASSOCIATIONS = ("marker", "body", "nearest", "none")
-_REACH = 0.25  # m: returns farther to the side of every link are not looked at
-_SIDE = 0.05  # m, σ_g: how far to the side of a link its surface reaches
-_GATE = 9.0  # of the squared distance above: three standard deviations
 _SIDE_SD = 0.01  # m: how well the side is known at which a ray passes a link
 _SHAPE = 0.015  # m, standard deviation of the surface about a capsule
-_LEAST_BULGE = 0.3
 _SLOPE = 0.15  # of the way from a return to its marker along the link, as depth that the pose may be wrong by
+_MOST = 8  # returns of one link and frame that count as distances: more say the same again
 _SCAN = 0.1  # s: what the thesis takes for one frame of the lidar
 _NEAREST_SD = 0.05  # m, of the thesis's way
-_HIDDEN_SD, _HIDDEN = 0.04, 4.0  # m: how well it is known what hides what; the most that being hidden costs
 _MARGIN = 0.1  # of the picture's size: how far outside it returns still count
-_WIDEST = 0.5  # m: σ_f is never more
-
-
-@dataclass(frozen=True, eq=False)
-class Attached:
-    """Returns attached to links. K of them.
-
-    ``row`` (K,) is the return's place in the lidar's arrays, ``frame`` (K,) the nearest frame's index,
-    ``start``, ``end`` (K,) the markers of its link, ``along`` (K,) is u, ``side`` and ``front`` (K,) are g
-    and f, m; ``bulge`` (K,) is c; ``depth`` (K,) is z in the camera's frame at the time of the frame, m.
-    """
-
-    row: np.ndarray
-    frame: np.ndarray
-    start: np.ndarray
-    end: np.ndarray
-    along: np.ndarray
-    side: np.ndarray
-    front: np.ndarray
-    bulge: np.ndarray
-    depth: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
 
 def associate(
@@ -77,6 +51,8 @@ def associate(
     how: str = "marker",
     front_sd: float = 0.1,
     pixels: np.ndarray | None = None,
+    camera: Camera | None = None,
+    late: float = 0.0,
 ) -> DepthData | None:
     """What the lidar of a sequence says of the skeleton.
 
@@ -97,6 +73,10 @@ def associate(
         σ_f: how far `positions` may be wrong along the line of sight, m.
     pixels : (N, M, 2), optional
         Detections in the lidar's camera, px, for ``"nearest"``.
+    camera : Camera, optional
+        The lidar's camera where a fit has corrected it.
+    late : float
+        How late that camera is, s, by a fit.
 
     Returns
     -------
@@ -111,14 +91,17 @@ def associate(
         )
     if sequence.lidar is None or how == "none":
         return None
-    lidar, camera = sequence.lidar, sequence.cameras[sequence.lidar.camera]
-    local = camera.to_camera(positions)
+    lidar = sequence.lidar
+    camera = sequence.cameras[lidar.camera] if camera is None else camera
+    local = camera.to_camera(positions_at(positions, late, 1 / sequence.fps))
     if how == "nearest":
         seen = camera.project(positions) if pixels is None else pixels
         return DepthData(camera.name, nearest_depths(sequence, camera, seen), surface=False)
-    found = attach(lidar, sequence.frames, sequence.fps, local, skeleton, surface, front_sd)
+    target = camera.to_camera(positions) if how == "body" else None  # whose residual knows no delay
+    found = attach(lidar, sequence.frames, sequence.fps, local, skeleton, surface, front_sd, target)
     rate = _depth_rate(local, sequence.fps)
     if how == "body":
+        found = _thinned(found)
         sd = np.sqrt(_own_variance(lidar, found, rate))
         places = (found.frame, found.start, found.end, found.along, found.bulge)
         return DepthData(camera.name, BodyReturns(*places, found.depth, sd))
@@ -126,79 +109,33 @@ def associate(
 
 
 def in_view(sequence: Sequence) -> Sequence:
-    """The same sequence with only the returns before its camera's picture, with a margin."""
+    """The same sequence with only the returns that its camera's picture shows, with a margin."""
     lidar = sequence.lidar
     if lidar is None or not len(lidar):
         return sequence
     camera = sequence.cameras[lidar.camera]
-    width, height = camera.resolution
-    edge = np.linspace(0.0, 1.0, 9)
-    border = np.concatenate([np.stack([edge, np.full(9, v)], 1) for v in (0.0, 1.0)])
-    border = np.concatenate([border, border[:, ::-1]]) * [width, height]
-    flat = camera.undistort(border)
-    margin = _MARGIN * np.ptp(flat, axis=0)
-    local = lidar.to_camera()
-    ahead = local[:, 2] > 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        seen = local[:, :2] / local[:, 2:]
-    keep = ahead & ((seen >= flat.min(0) - margin) & (seen <= flat.max(0) + margin)).all(-1)
-    return replace(sequence, lidar=lidar.select(keep))
+    size = np.array(camera.resolution)
+    seen = _at_rest(camera).project(lidar.to_camera())
+    with np.errstate(invalid="ignore"):
+        keep = ((seen >= -_MARGIN * size) & (seen <= (1 + _MARGIN) * size)).all(axis=-1)
+    return replace(sequence, lidar=lidar.select(np.asarray(keep)))
 
 
-def attach(
-    lidar: Lidar,
-    frames: np.ndarray,
-    fps: float,
-    local: np.ndarray,
-    skeleton: Skeleton,
-    surface: np.ndarray,
-    front_sd: float,
-) -> Attached:
-    """Attach returns to links; `local` (N, M, 3) are markers in the camera's frame, m."""
-    row, frame, before, share = _in_time(lidar, frames, fps)
-    xyz = lidar.to_camera()[row]
-    near = _near_body(xyz, local, before, front_sd)
-    row, frame, before, share, xyz = (v[near] for v in (row, frame, before, share, xyz))
-    links = _links(skeleton)
-    then = local[before] + share[:, None, None] * (
-        local[np.minimum(before + 1, len(local) - 1)] - local[before]
-    )
-    along, side, front = _against_links(xyz, then, links)
-    radius = (1 - along) * surface[links[:, 0]] + along * surface[links[:, 1]]  # (K, E)
-    bulge = _bulge(side, radius)
-    width = min(front_sd, _WIDEST)
-    reach = np.maximum(_SIDE, radius)
-    cost = (side / reach) ** 2 + ((front - bulge * radius) / width) ** 2
-    hidden = _behind(xyz[:, 2:] + front - bulge * radius, side < radius)
-    cost += np.minimum((hidden / _HIDDEN_SD) ** 2, _HIDDEN)
-    best = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=1) if len(xyz) else np.zeros(0, int)
-    every = np.arange(len(xyz))
-    good = cost[every, best] < _GATE
-    every, best = every[good], best[good]
-    start, end, u = links[best, 0], links[best, 1], along[every, best]
-    moved = _on_link(local[frame[every]], start, end, u) - _on_link(then[every], start, end, u)
-    return Attached(
-        row[every],
-        frame[every],
-        start,
-        end,
-        u,
-        side[every, best],
-        front[every, best],
-        bulge[every, best],
-        (xyz[every] + moved)[:, 2],
-    )
+def _at_rest(camera: Camera) -> Camera:
+    """The camera in its own frame."""
+    return replace(camera, rotation=np.eye(3), translation=np.zeros(3))
 
 
-def _behind(surface: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """How far surfaces (K, E), m, lie behind the nearest one that the ray hits; 0 where it hits none."""
-    nearest = np.where(hit, surface, np.inf).min(axis=1, keepdims=True, initial=np.inf)
-    return np.where(np.isfinite(nearest), np.maximum(surface - nearest, 0.0), 0.0)
-
-
-def _bulge(side: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """c = √(1 − (g/r)²), not less than :data:`_LEAST_BULGE`: shapes are not that round."""
-    return np.sqrt(np.maximum(1.0 - (side / np.maximum(radius, 1e-9)) ** 2, _LEAST_BULGE**2))
+def _thinned(found: Attached) -> Attached:
+    """At most :data:`_MOST` returns of one link and frame, spread evenly along it."""
+    order = np.lexsort((found.along, found.end, found.start, found.frame))
+    key = np.stack([found.frame, found.start, found.end])[:, order]
+    first = np.flatnonzero(np.r_[True, (np.diff(key) != 0).any(axis=0)]) if len(order) else order
+    count = np.diff(np.r_[first, len(order)])
+    rank = np.arange(len(order)) - np.repeat(first, count)
+    many = np.maximum(np.repeat(count, count), _MOST)
+    kept = order[(rank * _MOST) // many != ((rank - 1) * _MOST) // many]
+    return Attached(*(getattr(found, f.name)[kept] for f in fields(Attached)))
 
 
 def marker_depths(
@@ -211,12 +148,12 @@ def marker_depths(
     Returns of one marker and frame have one surface and one shape: only their ranges average out.
     """
     nearer = np.where(found.along < 0.5, found.start, found.end)
-    on_link = _on_link(local[found.frame], found.start, found.end, found.along)
+    axis = on_link(local[found.frame], found.start, found.end, found.along)
     marker = local[found.frame, nearer]
     u = found.along
     thicker = surface[nearer] - found.bulge * ((1 - u) * surface[found.start] + u * surface[found.end])
-    depth = found.depth + marker[:, 2] - on_link[:, 2] - thicker
-    way = np.linalg.norm(marker - on_link, axis=1)
+    depth = found.depth + marker[:, 2] - axis[:, 2] - thicker
+    way = np.linalg.norm(marker - axis, axis=1)
     own = _own_variance(lidar, found, rate)
     carried = own + (_SLOPE * way) ** 2
     key = found.frame * len(surface) + nearer
@@ -239,7 +176,7 @@ def nearest_depths(sequence: Sequence, camera: Camera, pixels: np.ndarray) -> Ma
     lidar = sequence.lidar
     assert lidar is not None
     local = lidar.to_camera()
-    at_rest = replace(camera, rotation=np.eye(3), translation=np.zeros(3))
+    at_rest = _at_rest(camera)
     seen = at_rest.project(local)
     inside = np.isfinite(seen).all(-1) & at_rest.inside(seen)
     time, z, seen = lidar.time[inside], local[inside, 2], seen[inside]
@@ -255,56 +192,6 @@ def nearest_depths(sequence: Sequence, camera: Camera, pixels: np.ndarray) -> Ma
     count = np.ones(len(table), dtype=int)
     sd = np.full(len(table), _NEAREST_SD)
     return MarkerDepths(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2], sd, count)
-
-
-def _in_time(lidar: Lidar, frames: np.ndarray, fps: float) -> tuple[np.ndarray, ...]:
-    """Returns within the sequence: rows, the nearest frame, the one before, share of the way to the next."""
-    place = lidar.time * fps - frames[0]
-    row = np.flatnonzero((place >= -0.5) & (place < len(frames) - 0.5))
-    place = place[row]
-    frame = np.clip(np.rint(place).astype(int), 0, len(frames) - 1)
-    before = np.clip(np.floor(place).astype(int), 0, max(len(frames) - 2, 0))
-    return row, frame, before, place - before
-
-
-def _near_body(xyz: np.ndarray, local: np.ndarray, before: np.ndarray, front_sd: float) -> np.ndarray:
-    """Rows of returns within reach of the box about the markers of the frames before and after them."""
-    reach = np.array([_REACH, _REACH, _REACH + 3 * front_sd])
-    lower, upper = local.min(axis=1) - reach, local.max(axis=1) + reach
-    lower[:-1], upper[:-1] = np.minimum(lower[:-1], lower[1:]), np.maximum(upper[:-1], upper[1:])
-    return np.flatnonzero(((xyz >= lower[before]) & (xyz <= upper[before])).all(-1))
-
-
-def _links(skeleton: Skeleton) -> np.ndarray:
-    """Marker pairs (E, 2) that have the body about them: what is drawn, and the solid body."""
-    pairs = {tuple(sorted(e)) for e in skeleton.edges} | {
-        tuple(sorted((a, b))) for a, b, _ in skeleton.capsules
-    }
-    return np.array(sorted(pairs), dtype=int).reshape(-1, 2)
-
-
-def _against_links(
-    xyz: np.ndarray, then: np.ndarray, links: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """u, g and f (K, E) of returns (K, 3) and every link of the skeleton (K, M, 3) at their times."""
-    flat = then[..., :2] / then[..., 2:]
-    a, b = flat[:, links[:, 0]], flat[:, links[:, 1]]
-    seen = (xyz[:, :2] / xyz[:, 2:])[:, None]
-    way = b - a
-    length = np.maximum((way**2).sum(-1), 1e-18)
-    inside = np.clip(((seen - a) * way).sum(-1) / length, 0.0, 1.0)
-    side = np.linalg.norm(seen - a - inside[..., None] * way, axis=-1) * xyz[:, None, 2]
-    z = then[..., 2]
-    start, end = z[:, links[:, 0]], z[:, links[:, 1]]
-    along = inside * start / ((1 - inside) * end + inside * start)
-    front = (1 - along) * z[:, links[:, 0]] + along * z[:, links[:, 1]] - xyz[:, None, 2]
-    return along, side, front
-
-
-def _on_link(points: np.ndarray, start: np.ndarray, end: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """(1 − u) a + u b of points (K, M, 3) with the markers of every row."""
-    every = np.arange(len(start))
-    return (1 - u)[:, None] * points[every, start] + u[:, None] * points[every, end]
 
 
 def _depth_rate(local: np.ndarray, fps: float) -> np.ndarray:

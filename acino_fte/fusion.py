@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from acino_fte.association import associate
+from acino_fte.cameras import Camera
 from acino_fte.depth import BodyReturns, DepthData, MarkerDepths, expected_surface
 from acino_fte.noise import PRIOR_COUNT, robust_scale
 from acino_fte.parameters import Parameters
+from acino_fte.prediction import corrected_cameras, positions_at, time_offsets
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton
 
@@ -107,6 +109,7 @@ class Fusion:
             self._learn(*found)
         front = _FRONT[min(self._looks, len(_FRONT) - 1)]
         self._looks += 1
+        camera, late = self._camera(found)
         data = associate(
             self.sequence,
             self.skeleton,
@@ -115,9 +118,11 @@ class Fusion:
             how=self.how,
             front_sd=front,
             pixels=self._pixels,
+            camera=camera,
+            late=late,
         )
         if data is not None and found is not None and self.how == "marker":
-            self.factor = self._scale(data, positions)
+            self.factor = self._scale(data, positions, found)
             data = replace(data, measured=replace(data.measured, sd=self.factor * data.measured.sd))
         self.data = data
 
@@ -127,19 +132,32 @@ class Fusion:
             origin = np.array([parameters.entries[i].origin for i in places])
             self.surface = origin + theta[places]
 
-    def _scale(self, data: DepthData, positions: np.ndarray) -> float:
+    def _camera(self, found: tuple[Parameters, np.ndarray] | None) -> tuple[Camera, float]:
+        """The lidar's camera as a fit has corrected it, and how late it is, s."""
+        assert self.sequence.lidar is not None
+        cameras, name = self.sequence.cameras, self.sequence.lidar.camera
+        if found is None:
+            return cameras[name], 0.0
+        return corrected_cameras(cameras, *found)[name], time_offsets(cameras, *found)[name]
+
+    def _scale(self, data: DepthData, positions: np.ndarray, found: tuple[Parameters, np.ndarray]) -> float:
         """Scale of the residuals in units of their standard deviations; the table counts like 20 depths."""
-        residuals = self._residuals(data, positions)
+        residuals = self._residuals(data, positions, found)
         scale = robust_scale(residuals.residual / residuals.sd)
         if not scale > 0:
             return self.factor
         count = len(residuals.sd)
         return float(np.clip(math.exp(count * math.log(scale) / (count + PRIOR_COUNT)), *_FACTORS))
 
-    def _residuals(self, data: DepthData, positions: np.ndarray) -> DepthResiduals:
-        local = self.sequence.cameras[data.camera].to_camera(positions)
+    def _residuals(
+        self, data: DepthData, positions: np.ndarray, fit: tuple[Parameters, np.ndarray]
+    ) -> DepthResiduals:
+        camera, late = self._camera(fit)
         surface = self.surface if data.surface else np.zeros_like(self.surface)
         found = data.measured
+        if isinstance(found, MarkerDepths):
+            positions = positions_at(positions, late, 1 / self.sequence.fps)
+        local = camera.to_camera(positions)
         if isinstance(found, MarkerDepths):
             predicted = local[found.frame, found.marker, 2] - surface[found.marker]
             return DepthResiduals(
@@ -159,7 +177,7 @@ class Fusion:
         if self.data is None:
             return None
         self._learn(*found)
-        return self._residuals(self.data, positions)
+        return self._residuals(self.data, positions, found)
 
     def findings(self) -> list[str]:
         """What the user should know of size and depth, one sentence each."""
@@ -167,16 +185,14 @@ class Fusion:
             count = 0 if self.data is None else len(self.data.measured)
             if count:
                 return []
-            return [
-                "no return of the lidar is on the animal: its size, and with it every distance, is that of "
-                "the species' segment lengths (check calibration and synchronisation of the lidar)"
-            ]
-        if len(self.sequence.cameras) > 1:
+            said = "no return of the lidar is on the animal: check its calibration and synchronisation"
+        else:
+            said = "one camera and no lidar" if self.sequence.lidar is None else "the lidar is not used"
+        if len(self.sequence.cameras) == 1:
+            said += "; the animal's size, and with it every distance, is that of the species' segment lengths"
+        elif not self.used and self.sequence.lidar is None:
             return []
-        return [
-            "one camera and no lidar: the size of the animal, and with it every distance, is that of the "
-            "species' segment lengths"
-        ]
+        return [said]
 
 
 def _body_residuals(

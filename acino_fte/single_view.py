@@ -45,6 +45,7 @@ _DRIFT = 0.05  # per √s: how the error of the size changes while the animal tu
 _TOLERANCE = 0.6  # m: half the depth of an animal and its lean
 _ENOUGH = 3e-3  # relative decrease of the objective per iteration below which the start is good enough
 _ITERATIONS = 12  # a right heading is there after ten
+_FARTHEST = 3000.0  # m: a larger distance means detections that are all at one point
 _SIZES = (0.6, 1.6)  # how far from the species' size an animal may be
 
 
@@ -182,7 +183,16 @@ def depth_from_size(kinematics: Kinematics, flat: np.ndarray, fps: float) -> np.
             expected=f"markers of '{skeleton.name}' that a link joins, in the same frame",
             remedy="lower --likelihood, or choose frames in which more of the animal is detected",
         )
-    return _running_median(frame, depth[frame, link], len(flat), fps, _QUANTILE)
+    found = _running_median(frame, depth[frame, link], len(flat), fps, _QUANTILE)
+    if np.median(found) > _FARTHEST:
+        raise InputError(
+            "The animal is too small in the image to say anything of it.",
+            key="keypoints",
+            expected=f"a '{skeleton.name}' within {_FARTHEST:.0f} m of the camera",
+            found=f"one as small as at {np.median(found):.3g} m",
+            remedy="check that the detections are in pixels, and not all at one point",
+        )
+    return found
 
 
 def _rigid_links(kinematics: Kinematics) -> tuple[np.ndarray, np.ndarray]:
@@ -211,7 +221,6 @@ def _returns_on_skeleton(
     frame, local = np.clip(np.rint(place[keep]).astype(int), 0, len(flat) - 1), local[keep]
     likely = (local[:, 2] > _SIZES[0] * size[frame]) & (local[:, 2] < _SIZES[1] * size[frame])
     frame, local = frame[likely], local[likely]
-    seen = local[:, :2] / local[:, 2:]
     seen = local[:, :2] / local[:, 2:]
     margin = (_ON_BODY / size)[:, None]
     with warnings.catch_warnings():

@@ -3,11 +3,11 @@
     python benchmarks/bench_fusion.py [--seeds 3] [--frames 120]
 
 Simulated recordings with the rig's defaults: 3 px, 15 % missing, 3 % outliers, 10 % of the returns on the
-animal from something else, a surface 4 cm before the joints; 90 m at 2048 px and 50 m at 852 px. Besides the
-lidar's scan, one return for every marker (``pseudo``, as a pseudo-RGB-D image gives). The last rows have a body
-of the species' own radii, a calibration that is 0.5 mrad off, and a lidar that is 5 ms late. Ratios are against
-the thesis's nearest return on the same recording. Seconds are of the whole estimate with its covariance, after
-a first run that derives and compiles the formulas.
+animal from something else, a surface 4 cm before the joints; 90 m at 2048 px and 50 m at 852 px. Besides
+the lidar's scan, one return for every marker (``pseudo``, as a pseudo-RGB-D image gives). The last rows have
+a body of the species' own radii, a calibration that is 0.5 mrad off, and a lidar that is 5 ms late. Ratios
+are against the thesis's nearest return on the same recording. Seconds are of the whole estimate with its
+covariance, after a first run that derives and compiles the formulas.
 """
 
 from __future__ import annotations

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
+import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,11 @@ from acino_fte.errors import InputError, did_you_mean
 from acino_fte.lidar import Lidar
 
 _ARRAYS = ("time", "xyz", "intensity")
+_LENS_PX = 5.0
+_DAMAGE = (  # what the readers of zip, of zlib and of NumPy's headers raise
+    *(OSError, ValueError, TypeError, EOFError, KeyError, AttributeError, RuntimeError, MemoryError),
+    *(SyntaxError, NotImplementedError, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
 
 
 def read_lidar(entry: LidarEntry, cameras: CameraArray, source: Path) -> Lidar:
@@ -43,8 +51,7 @@ def read_lidar(entry: LidarEntry, cameras: CameraArray, source: Path) -> Lidar:
             found=entry.camera,
             remedy="use the name of a camera that has keypoints",
         )
-    camera = cameras[entry.camera]
-    calibration = read_lidar_camera(entry.calibration, entry.direction, camera=camera).camera
+    calibration = read_lidar_camera(entry.calibration, entry.direction, camera=cameras[entry.camera]).camera
     arrays = read_returns(Path(entry.returns))
     order = np.argsort(arrays["time"], kind="stable")
     return Lidar(
@@ -74,13 +81,13 @@ def read_returns(path: Path) -> dict[str, np.ndarray]:
         raise InputError(
             "The lidar's returns are not there.", file=path, key="lidar.returns", remedy="check the path"
         ) from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, AttributeError):
+    except _DAMAGE as error:
         raise InputError(
             "The lidar's returns cannot be read.",
             file=path,
             key="lidar.returns",
             expected=f"an .npz with the arrays {', '.join(_ARRAYS)}",
-            found="something else, or a damaged file",
+            found=f"something else, or a damaged file ({type(error).__name__})",
             remedy="make it again with 'acino-fte import-recording'",
         ) from None
     count = len(arrays["time"]) if "time" in arrays and arrays["time"].ndim == 1 else -1
@@ -96,4 +103,37 @@ def read_returns(path: Path) -> dict[str, np.ndarray]:
             found=", ".join(f"{n} {a.shape} {a.dtype}" for n, a in sorted(arrays.items())) or "none of them",
             remedy="make it again with 'acino-fte import-recording'",
         )
-    return {name: np.asarray(array, dtype=float) for name, array in arrays.items()}
+    found = {name: np.asarray(array, dtype=float) for name, array in arrays.items()}
+    wrong = sum(int((~np.isfinite(array)).sum()) for array in found.values())
+    if wrong:
+        raise InputError(
+            "The lidar's returns hold numbers that are not finite.",
+            file=path,
+            key="lidar.returns",
+            found=f"{wrong} of them",
+            remedy="leave such returns out of the file",
+        )
+    return found
+
+
+def lens_warnings(entry: LidarEntry, cameras: CameraArray) -> list[str]:
+    """What is to be said where the calibration was solved with another lens than the sequence's camera has.
+
+    Pose and lens are solved together: a camera that is nearer with a shorter lens sees nearly the same, and
+    the pose of the one is wrong for the other.
+    """
+    camera = cameras[entry.camera]
+    solved = read_lidar_camera(entry.calibration, entry.direction, camera=camera).camera
+    width, height = camera.resolution
+    u, v = np.meshgrid(np.linspace(0.1, 0.9, 5) * width, np.linspace(0.1, 0.9, 5) * height)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    at_rest = replace(solved, rotation=np.eye(3), translation=np.zeros(3))
+    scale = np.array([width, height]) / np.array(solved.resolution)
+    gap = np.linalg.norm(at_rest.project(camera.directions(pixels)) * scale - pixels, axis=1)
+    worst = float(np.nanmax(gap)) if np.isfinite(gap).any() else np.inf
+    if worst <= _LENS_PX:
+        return []
+    return [
+        f"the lidar was calibrated with another lens than camera '{entry.camera}' has: up to {worst:.0f} px "
+        f"apart in the picture; use the camera of {Path(entry.calibration).name} in cameras.json"
+    ]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from acino_fte.association import associate, attach, in_view
+from acino_fte.association import associate, in_view
+from acino_fte.attaching import attach
 from acino_fte.cameras import Camera, CameraArray
 from acino_fte.depth import BodyReturns, MarkerDepths
 from acino_fte.errors import InputError

@@ -56,7 +56,7 @@ def test_a_run_may_leave_the_lidar_out(folder, tmp_path):
     )
     assert done.exit_code == 0, done.output
     assert not (out / "depth.csv").exists()
-    assert "no lidar" in done.output
+    assert "the lidar is not used" in done.output
 
 
 def edited(folder, old, new):
@@ -70,6 +70,19 @@ def broken_arrays(folder, **arrays):
     np.savez(folder / "lidar.npz", **arrays)
 
 
+def as_array(path):
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def flipped(path):
+    """Damage in the middle of the compressed stream of the largest array."""
+    whole = bytearray(path.read_bytes())
+    for i in range(len(whole) // 2, len(whole) // 2 + 64):
+        whole[i] ^= 0xFF
+    path.write_bytes(whole)
+
+
 FAULTS = {
     "camera": (lambda f: edited(f, "camera: cam1", "camera: cam2"), "lidar.camera"),
     "key": (lambda f: edited(f, "range_sd", "range_ds"), "range_ds"),
@@ -78,6 +91,8 @@ FAULTS = {
     "text": (lambda f: (f / "lidar.npz").write_text("x,y,z"), "lidar.returns"),
     "empty": (lambda f: (f / "lidar.npz").write_bytes(b""), "lidar.returns"),
     "cut": (lambda f: (f / "lidar.npz").write_bytes((f / "lidar.npz").read_bytes()[:900]), "lidar.returns"),
+    "array": (lambda f: as_array(f / "lidar.npz"), "lidar.returns"),
+    "flipped": (lambda f: flipped(f / "lidar.npz"), "lidar.returns"),
     "arrays": (lambda f: broken_arrays(f, time=np.zeros(3)), "time (3,)"),
     "shape": (lambda f: broken_arrays(f, time=np.zeros(3), xyz=np.zeros((2, 3))), "xyz (2, 3)"),
     "kind": (lambda f: broken_arrays(f, time=np.array(["a"]), xyz=np.zeros((1, 3))), "<U1"),
@@ -101,6 +116,16 @@ def test_a_fault_is_one_message(folder, fault, tmp_path):
         done = CliRunner().invoke(app, ["run", str(folder), "-o", str(tmp_path / "out")])
         assert done.exit_code == 2
         assert not (tmp_path / "out").exists()
+
+
+def test_a_calibration_with_another_lens_is_told(folder):
+    path = folder / "lidar_camera.json"
+    calibration = json.loads(path.read_text())
+    assert not load_sequence(folder).warnings
+    calibration["camera_matrix"][0][0] *= 1.05
+    path.write_text(json.dumps(calibration))
+    (said,) = load_sequence(folder).warnings
+    assert "another lens" in said
 
 
 def test_returns_without_intensity_are_read(tmp_path):
