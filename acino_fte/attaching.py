@@ -92,7 +92,7 @@ def attach(
 
 @dataclass(frozen=True, eq=False)
 class _Near:
-    """Returns to be attached: row, nearest frame, frame before, share of the way to the next, place (K, 3)."""
+    """Returns to be attached: row, nearest frame, frame before, share of the way on, place (K, 3)."""
 
     row: np.ndarray
     frame: np.ndarray

@@ -22,8 +22,11 @@ from acino_fte.depth import (
 )
 from acino_fte.explicit import build_explicit
 from acino_fte.explicit_solve import minimise_explicit
+from acino_fte.fusion import Fusion
+from acino_fte.lidar import Lidar
 from acino_fte.losses import Loss
 from acino_fte.parameters import Parameters, with_surface
+from acino_fte.prediction import corrected_cameras, positions_at
 from acino_fte.problem import Assumptions, FTEOptions, build_fte
 from acino_fte.skeleton import load_skeleton
 from acino_fte.solve import SolveOptions, minimise
@@ -163,3 +166,25 @@ def test_no_depths_make_no_terms(lizard):
     assert "depth" not in {t.family for t in problem.terms}
     result = minimise(problem, q)
     assert result.status.ok
+
+
+def test_a_corrected_and_late_camera_takes_its_lidar_along(lizard):
+    """What is reported is the residual of the problem, whatever of the camera has been estimated."""
+    q = random_motion(lizard.skeleton, 12, 4)
+    sequence = make_sequence(lizard, q, cameras_about(12))
+    families = FTEOptions(fit=("extrinsics", "delay"))
+    parameters = build_fte(sequence, lizard, families).parameters
+    theta = np.zeros(len(parameters))
+    theta[parameters.place("extrinsics", "c1", "tz")] = 0.2
+    theta[parameters.place("delay", "c1")] = 0.4 / sequence.fps
+    (camera,) = [c for c in corrected_cameras(sequence.cameras, parameters, theta) if c.name == "c1"]
+    z = camera.to_camera(positions_at(lizard.positions(q), 0.4 / sequence.fps, 1 / sequence.fps))
+    seen = z - 0.03 * np.array([0.0, 0, 1])
+    xyz, time = seen[:, :3].reshape(-1, 3), np.repeat(np.arange(12), 3) / sequence.fps
+    lidar = Lidar("c1", time, xyz, np.zeros(36), np.eye(3), np.zeros(3))
+    fusion = Fusion(replace(sequence, lidar=lidar), lizard.skeleton, "marker", np.zeros((12, 4, 6, 2)))
+    fusion.surface[:] = 0.03
+    fusion.look(lizard.positions(q), (parameters, theta))
+    found = fusion.residuals(lizard.positions(q), (parameters, theta))
+    assert len(found.residual) >= 12
+    assert np.abs(found.residual).max() < 0.01
