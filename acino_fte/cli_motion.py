@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -80,7 +81,10 @@ def camera_motion(
         str | None, typer.Option(help="The camera that moved.", show_default="the only one")
     ] = None,
     start: Annotated[
-        float, typer.Option(help="Time of frame 0, s from the first sample of the sensor or encoders.")
+        float,
+        typer.Option(
+            help="Time of frame 0, s from the first sample of the sensor or encoders.", min=-1e6, max=1e6
+        ),
     ] = 0.0,
     topic: Annotated[
         str | None, typer.Option(help="Stream of a recording.", show_default="the only one of its kind")
@@ -108,7 +112,7 @@ def camera_motion(
         str | None, typer.Option(help="s, ms, us or ns, unless the header says it.", rich_help_panel=_IMU)
     ] = None,
     sample_rate: Annotated[
-        Float_, typer.Option(help="Hz, of a table without times.", rich_help_panel=_IMU)
+        Float_, typer.Option(help="Hz, of a table without times.", min=1e-3, max=1e6, rich_help_panel=_IMU)
     ] = None,
     method: Annotated[
         _Method,
@@ -123,7 +127,12 @@ def camera_motion(
     ] = _Model.auto,
     scale: Annotated[
         Float_,
-        typer.Option(help="Length of the first step, m; pictures do not tell it.", rich_help_panel=_VIDEO),
+        typer.Option(
+            help="Length of the first step, m; pictures do not tell it.",
+            min=1e-6,
+            max=1e6,
+            rich_help_panel=_VIDEO,
+        ),
     ] = None,
     counts: Annotated[
         tuple[float, float] | None,
@@ -191,16 +200,17 @@ def camera_motion(
         sequence = load_sequence(folder, frames=(None, None))
         name = _camera_name(sequence, camera)
         _check_needs(source, counts, imu_to_camera, video)
-        if source is _From.video:
-            motion = _from_video(sequence, name, file, model.value, tell)
-        elif source is _From.encoders:
-            read = encoder_counts(file, topic, encoders, sequence.fps, start)
-            motion = _from_encoders(sequence, read, (counts or (0, 0), zero, sign, lever), start)
-        else:
-            units = {"rate_unit": rate_unit, "force_unit": force_unit, "time_unit": time_unit}
-            samples, notes = inertial_samples(file, topic, units, sample_rate)
-            motion = _from_imu(sequence, name, samples, (imu_to_camera, video), method.value, start, tell)
-            motion = replace(motion, notes=notes + motion.notes)
+        with _about(file):
+            if source is _From.video:
+                motion = _from_video(sequence, name, file, model.value, tell)
+            elif source is _From.encoders:
+                read = encoder_counts(file, topic, encoders, sequence.fps, start)
+                motion = _from_encoders(sequence, read, (counts or (0, 0), zero, sign, lever), start)
+            else:
+                units = {"rate_unit": rate_unit, "force_unit": force_unit, "time_unit": time_unit}
+                samples, notes = inertial_samples(file, topic, units, sample_rate)
+                motion = _from_imu(sequence, name, samples, (imu_to_camera, video), method.value, start, tell)
+                motion = replace(motion, notes=notes + motion.notes)
         motion = part_of(motion, sequence.n_frames)
         tell("writing")
         note = save_motion(
@@ -214,6 +224,18 @@ def camera_motion(
             note={"sequence": sequence.name, "file": file.name},
         )
     _tell_result(note, target, quiet)
+
+
+@contextmanager
+def _about(file: Path) -> Iterator[None]:
+    """Errors that name no file are about this one."""
+    try:
+        yield
+    except InputError as error:
+        if error.file is not None or error.key is not None and error.key.startswith("--"):
+            raise
+        parts = {name: getattr(error, name) for name in ("key", "expected", "found", "remedy")}
+        raise InputError(error.problem, file=file, **parts) from None
 
 
 def _tell_result(note: dict[str, Any], target: Path, quiet: bool) -> None:
@@ -297,7 +319,7 @@ def _from_encoders(
         inside = (frame >= 0) & (frame < n)
         counts[frame[inside]] = read.counts[inside]
     elif time is not None:
-        frame_time = np.nanmin(time) + start + np.arange(n) / sequence.fps
+        frame_time = np.min(time[np.isfinite(time)], initial=np.inf) + start + np.arange(n) / sequence.fps
     motion = motion_from_encoders(counts, geometry, time=time, frame_time=frame_time)
     return replace(motion, notes=read.notes + motion.notes)
 
@@ -339,7 +361,8 @@ def _mounting(
     if said == "same":
         return Mounting(np.eye(3), np.zeros((3, 3)))
     if said == "auto" and video is not None:
-        seen = _from_video(sequence, name, video, "auto", tell)
+        with _about(video):
+            seen = _from_video(sequence, name, video, "auto", tell)
         n = min(len(seen), len(stamps))
         from acino_fte.data_tools.camera_motion_files import part_of
 
@@ -366,7 +389,11 @@ def _rotation_file(path: Path) -> np.ndarray:
         or np.linalg.det(matrix) < 0
     ):
         raise InputError(
-            "The mounting of the sensor is no rotation.", file=path, expected="3×3, right-handed"
+            "The mounting of the sensor is no rotation.",
+            file=path,
+            key="--imu-to-camera",
+            expected="3×3, rows of length 1 at right angles, right-handed",
+            found=str(matrix.tolist())[:200],
         )
     u, _, vt = np.linalg.svd(matrix)
     return u @ vt

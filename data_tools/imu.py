@@ -20,6 +20,7 @@ from acino_fte.errors import InputError
 Method = Literal["first", "midpoint", "simpson", "mean"]
 METHODS: tuple[Method, ...] = ("first", "midpoint", "simpson", "mean")
 _UNEVEN = 8.0  # a stencil whose steps differ by more is not interpolated by a cubic
+_MOST_RATE, _MOST_FORCE = 1e3, 1e5  # rad/s, m/s²: beyond what any sensor can say
 _GAP = 5.0  # median steps from which on a step is a gap
 
 
@@ -89,7 +90,7 @@ class Attitude:
 
 
 def checked_samples(samples: ImuSamples, least: int = 2) -> tuple[ImuSamples, tuple[str, ...]]:
-    """Samples that can be integrated, and notes: those with NaN or with the stamp before left out.
+    """Samples that can be integrated, and notes: those that no sensor says or with the stamp before left out.
 
     Raises
     ------
@@ -97,7 +98,8 @@ def checked_samples(samples: ImuSamples, least: int = 2) -> tuple[ImuSamples, tu
         Too few are left, or stamps run backwards.
     """
     time = np.asarray(samples.time_ns, dtype=np.int64)
-    good = np.isfinite(samples.rate).all(1) & np.isfinite(samples.force).all(1)
+    with np.errstate(invalid="ignore"):
+        good = (np.abs(samples.rate) < _MOST_RATE).all(1) & (np.abs(samples.force) < _MOST_FORCE).all(1)
     rows = np.flatnonzero(good)
     step = np.diff(time[rows])
     if (step < 0).any():
@@ -116,9 +118,8 @@ def checked_samples(samples: ImuSamples, least: int = 2) -> tuple[ImuSamples, tu
         )
     notes = []
     if len(rows) < len(time):
-        notes.append(
-            f"{len(time) - len(rows)} of {len(time)} inertial samples left out (NaN or a stamp twice)."
-        )
+        left_out = f"{len(time) - len(rows)} of {len(time)} inertial samples left out"
+        notes.append(f"{left_out} (no number, an impossible one, or a stamp twice).")
     kept = ImuSamples(
         time[rows], np.asarray(samples.rate)[rows], np.asarray(samples.force)[rows], samples.clock
     )

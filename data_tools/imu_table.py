@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acino_fte.data_tools.recording import GRAVITY, ImuSamples
+from acino_fte.data_tools.text_tables import column_numbers, read_text_table
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ TIME_UNITS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 RATE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 FORCE_UNITS = {"m/s2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY}
 _ALIKE = {"µs": "us", "μs": "us", "sec": "s", "m/s²": "m/s2", "m/s^2": "m/s2", "°/s": "deg/s", "dps": "deg/s"}
+_WORDS = {"time": "time", "rate": "rate", "force": "specific force"}
+_LONGEST_NS = 4e18  # of a stamp: 127 years
 _TIME = re.compile(r"^(time|timestamp|stamp|t)([_ ].*)?$")
 _AXES = {
     "rate": re.compile(r"^(gyr|gyro|gyroscope|omega|rate|angular[_ ]velocity|w)[_ .]*([xyz])$"),
@@ -59,56 +62,20 @@ def read_imu_table(
         The file cannot be read, a column is missing, or a unit is not stated.
     """
     path = Path(path)
-    table, comments = _table(path)
+    table, comments = read_text_table(path, "inertial samples")
     bare = {name: _split(name) for name in table.columns}
     chosen = _columns(path, bare, columns or {})
     scale = {
         key: _unit(path, key, [bare[c][1] for c in chosen[key]], given, known)
         for key, given, known in (("rate", rate_unit, RATE_UNITS), ("force", force_unit, FORCE_UNITS))
     }
-    values = {key: _numbers(path, table, chosen[key]) * scale[key] for key in scale}
+    values = {key: column_numbers(path, table, chosen[key]) * scale[key] for key in scale}
     if chosen["time"]:
         unit = _unit(path, "time", [bare[chosen["time"][0]][1]], time_unit, TIME_UNITS)
-        time_ns = np.round(_numbers(path, table, chosen["time"])[:, 0] * unit)
-        time_ns = _finite_times(path, time_ns)
+        time_ns = _whole_times(path, np.round(column_numbers(path, table, chosen["time"])[:, 0] * unit))
     else:
-        hertz = sample_rate or _stated_rate(comments)
-        if not hertz:
-            raise InputError(
-                "The table has no column of time, and no sample rate is known.",
-                file=path,
-                expected="a column 'time' with its unit, or a sample rate",
-                found=", ".join(map(str, table.columns))[:200],
-                remedy="give the sample rate in Hz",
-            )
-        time_ns = np.round(np.arange(len(table)) * 1e9 / hertz).astype(np.int64)
+        time_ns = _even_times(path, table, comments, sample_rate)
     return ImuSamples(time_ns, values["rate"], values["force"])
-
-
-def _table(path: Path) -> tuple[pd.DataFrame, list[str]]:
-    import pandas as pd
-
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            "The inertial samples cannot be read.", file=path, found=str(error), remedy="check the path"
-        ) from None
-    comments = [line for line in lines if line.startswith(("//", "#"))]
-    rows = [line for line in lines if line.strip() and not line.startswith(("//", "#"))]
-    header = rows[0] if rows else ""
-    mark = next((m for m in (",", ";", "\t") if m in header), None)
-    cells = [[c.strip() for c in (row.split(mark) if mark else row.split())] for row in rows]
-    width = len([c for c in cells[0] if c]) if cells else 0
-    if len(cells) < 2:
-        raise InputError(
-            "The table of inertial samples is empty.",
-            file=path,
-            expected="a line of names and a line for each sample",
-            found=f"{len(cells)} line(s)",
-        )
-    body = [row[:width] + [""] * (width - len(row)) for row in cells[1:]]  # a last line may be cut
-    return pd.DataFrame(body, columns=cells[0][:width]), comments
 
 
 def _split(name: str) -> tuple[str, str | None]:
@@ -132,19 +99,18 @@ def _columns(
         elif key == "time":
             out[key] = [name for name, (text, _) in bare.items() if _TIME.match(text)][:1]
         else:
-            axes = {m[2]: name for name, (text, _) in bare.items() if (m := _AXES[key].match(text))}
-            out[key] = [axes[a] for a in "xyz" if a in axes]
+            axes = [(m[2], name) for name, (text, _) in bare.items() if (m := _AXES[key].match(text))]
+            out[key] = [name for _, name in sorted(axes)] if {axis for axis, _ in axes} == set("xyz") else []
         missing = [name for name in out[key] if name not in bare]
-        if missing or (key != "time" and len(out[key]) != 3):
+        few = key != "time" and len(out[key]) < 3
+        if missing or few or len(out[key]) > 3:
             raise InputError(
-                f"The table lacks columns of the {'specific force' if key == 'force' else key}.",
+                f"The table {'lacks' if missing or few else 'has too many'} columns of the {_WORDS[key]}.",
                 file=path,
                 key=key,
-                expected=", ".join(out[key])
-                if missing
-                else f"three columns such as {key}_x, {key}_y, {key}_z",
-                found=", ".join(bare)[:200],
-                remedy="name the columns",
+                expected=", ".join(missing) or f"three columns such as {key}_x, {key}_y, {key}_z",
+                found=", ".join(bare if missing or few else out[key])[:200],
+                remedy="name them so in the first line of the table, and other columns differently",
             )
     return out
 
@@ -152,60 +118,48 @@ def _columns(
 def _unit(
     path: Path, key: str, stated: Sequence[str | None], given: str | None, known: Mapping[str, float]
 ) -> float:
-    """Factor to SI; the unit given wins, else the header states it."""
-    found = given or next((unit for unit in stated if unit), None)
-    found = _ALIKE.get(found, found) if found else None
-    if found is not None and found in known:
-        return known[found]
-    what = "specific force" if key == "force" else key
+    """Factor to SI; the unit given wins, else the header states it, the same one for all columns."""
+    units = {given} if given else {unit for unit in stated if unit}
+    units = {_ALIKE.get(unit, unit) for unit in units}
+    if len(units) == 1 and (unit := units.pop()) in known:
+        return known[unit]
     raise InputError(
-        f"The unit of the {what} is not known, and it is never guessed.",
+        f"The unit of the {_WORDS[key]} is not known, and it is never guessed.",
         file=path,
         key=key,
         expected=" or ".join(known),
-        found=found or "none in the header",
+        found=given or ", ".join(str(unit) for unit in stated if unit) or "none in the header",
         remedy=f"state it (--{key}-unit)",
     )
 
 
-def _numbers(path: Path, table: pd.DataFrame, names: Sequence[str]) -> np.ndarray:
-    """Columns (K, …) as numbers; empty cells are NaN."""
-    import pandas as pd
-
-    out = np.empty((len(table), len(names)))
-    for i, name in enumerate(names):
-        text = table[name]
-        values = pd.to_numeric(text, errors="coerce")
-        wrong = values.isna() & ~text.str.lower().isin(["", "nan", "na"])
-        if wrong.any():
-            row = int(np.flatnonzero(wrong)[0])
-            if row != len(table) - 1:  # the last line of a cut file may end within a number
-                raise InputError(
-                    "The inertial samples hold something that is no number.",
-                    file=path,
-                    key=f"{name}, sample {row}",
-                    found=repr(text.iloc[row]),
-                )
-        out[:, i] = values
-    return out
-
-
-def _finite_times(path: Path, time_ns: np.ndarray) -> np.ndarray:
-    bad = np.flatnonzero(~np.isfinite(time_ns))
+def _whole_times(path: Path, time_ns: np.ndarray) -> np.ndarray:
+    """Stamps (K,) as integers, ns."""
+    bad = np.flatnonzero(~(np.abs(time_ns) < _LONGEST_NS))
     if len(bad):
         raise InputError(
-            "A sample has no time.",
+            "A sample has no time that can be.",
             file=path,
             key=f"sample {int(bad[0])}",
-            expected="a number",
-            found="nothing",
+            expected=f"a number, of at most {_LONGEST_NS * 1e-9:.0f} s",
+            found=f"{time_ns[bad[0]] * 1e-9:g} s",
+            remedy="check the unit of the times, and the line",
         )
     return time_ns.astype(np.int64)
 
 
-def _stated_rate(comments: Sequence[str]) -> float | None:
+def _even_times(path: Path, table: pd.DataFrame, comments: Sequence[str], hertz: float | None) -> np.ndarray:
+    """Stamps (K,), ns, of a table without times, by the rate that is given or that a comment states."""
     for line in comments:
-        match = re.search(r"sampl\w* *rate\D*([0-9.]+) *hz", line, re.IGNORECASE)
-        if match:
-            return float(match[1])
-    return None
+        match = re.search(r"sampl\w* *rate\D*([0-9]+(?:\.[0-9]*)?) *hz", line, re.IGNORECASE)
+        if match and hertz is None:
+            hertz = float(match[1])
+    if hertz is None or not 0 < hertz < 1e9:
+        raise InputError(
+            "The table has no column of time, and no sample rate is known.",
+            file=path,
+            expected="a column 'time' with its unit, or a sample rate above 0",
+            found=", ".join(map(str, table.columns))[:200],
+            remedy="give the sample rate in Hz (--sample-rate)",
+        )
+    return np.round(np.arange(len(table)) * 1e9 / hertz).astype(np.int64)

@@ -14,10 +14,12 @@ import numpy as np
 
 from acino_fte.data_tools.camera_motion import CameraMotion, bridged
 from acino_fte.data_tools.rotations import rotation_matrix
+from acino_fte.data_tools.text_tables import column_numbers, read_text_table
 from acino_fte.errors import InputError
 
 FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Head to camera of a camera that looks along the head's x with its top up."""
+_MOST_FRAMES, _MOST_COUNTS = 1e9, 1e15
 _GAP = 5.0  # median steps of the encoders' samples, across which nothing is interpolated
 
 
@@ -52,12 +54,19 @@ class PanTiltHead:
     base_to_world: np.ndarray = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        if not all(np.isfinite(c) and c > 0 for c in self.counts_per_turn):
+        if not all(1 <= c < np.inf for c in self.counts_per_turn):
             raise InputError(
                 "The encoders' counts per turn are impossible.",
                 key="counts_per_turn",
-                expected="two numbers > 0 (a direction is told by the sign)",
+                expected="two numbers from 1 (a direction is told by the sign)",
                 found=f"{self.counts_per_turn}",
+            )
+        if not (np.isfinite(self.zero).all() and np.isfinite(self.lever).all()):
+            raise InputError(
+                "The zero of the encoders and the camera's lever are numbers.",
+                key="zero, lever",
+                expected="counts; m",
+                found=f"{self.zero}, {tuple(self.lever)}",
             )
         if any(s not in (1, -1) for s in self.sign):
             raise InputError(
@@ -120,6 +129,7 @@ def motion_from_encoders(
         raise InputError(
             "The encoders' counts have a wrong shape.", expected="(K, 2)", found=f"{counts.shape}"
         )
+    counts = np.where(np.abs(counts) < _MOST_COUNTS, counts, np.nan)
     good = np.isfinite(counts).all(1)
     angles = np.full_like(counts, np.nan)
     angles[good] = head.angles(counts[good])
@@ -190,24 +200,9 @@ def read_encoder_table(path: Path | str) -> tuple[np.ndarray, np.ndarray | None,
     InputError
         The file cannot be read, or lacks a column.
     """
-    import pandas as pd
-
     path = Path(path)
-    try:
-        table = pd.read_csv(
-            path, sep=None, engine="python", encoding="utf-8-sig", comment="#", index_col=False
-        )
-    except (
-        OSError,
-        UnicodeDecodeError,
-        pd.errors.ParserError,
-        pd.errors.EmptyDataError,
-        ValueError,
-    ) as error:
-        raise InputError(
-            "The encoders' counts cannot be read.", file=path, found=str(error), remedy="check the path"
-        ) from None
-    names = {str(name).strip().lower().split("(")[0].strip(): name for name in table.columns}
+    table, _ = read_text_table(path, "counts of the encoders")
+    names = {str(name).lower().split("(")[0].strip(): str(name) for name in table.columns}
     if not {"pan", "tilt"} <= set(names):
         raise InputError(
             "The encoders' table lacks columns.",
@@ -215,12 +210,22 @@ def read_encoder_table(path: Path | str) -> tuple[np.ndarray, np.ndarray | None,
             expected="pan, tilt (counts), and time (s) or frame",
             found=", ".join(map(str, table.columns))[:200],
         )
-    numbers = {key: pd.to_numeric(table[names[key]], errors="coerce").to_numpy(float) for key in names}
-    frame = numbers.get("frame")
-    if frame is not None and not (np.isfinite(frame).all() and (np.diff(frame) > 0).all()):
-        raise InputError("The frames of the encoders' table do not grow.", file=path, key="frame")
-    return (
-        np.stack([numbers["pan"], numbers["tilt"]], axis=1),
-        numbers.get("time"),
-        None if frame is None else frame.astype(int),
+    counts = column_numbers(path, table, [names["pan"], names["tilt"]])
+    time, frame = (
+        column_numbers(path, table, [names[key]])[:, 0] if key in names else None for key in ("time", "frame")
     )
+    return counts, time, None if frame is None else _whole_frames(path, frame)
+
+
+def _whole_frames(path: Path, frame: np.ndarray) -> np.ndarray:
+    """Frames (K,) as integers."""
+    whole = (np.abs(frame) < _MOST_FRAMES) & (np.round(frame) == frame)
+    if not (whole.all() and (np.diff(frame) > 0).all()):
+        raise InputError(
+            "The frames of the encoders' table do not grow.",
+            file=path,
+            key="frame",
+            expected="whole numbers from 0, each once, in order",
+            found=", ".join(f"{value:g}" for value in frame[:5]) + (", …" if len(frame) > 5 else ""),
+        )
+    return frame.astype(int)

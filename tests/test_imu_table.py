@@ -58,10 +58,15 @@ NAMES = "time (s),gyr_x,gyr_y,gyr_z,acc_x,acc_y,acc_z\n"
         (NAMES.replace("time (s),", "").replace("gyr", "gyro") + "0,0,0,0,0,1\n" * 2, "sample rate"),
         (NAMES + "0,0,x,0,0,0,1\n1,0,0,0,0,0,1\n", "no number"),
         (NAMES + ",0,0,0,0,0,1\n1,0,0,0,0,0,1\n", "no time"),
+        (NAMES + "1e30,0,0,0,0,0,1\n1,0,0,0,0,0,1\n", "no time that can be"),
+        (NAMES.replace("gyr_y", "gyr_x") + "0,0,0,0,0,0,1\n" * 2, "there twice"),
+        (NAMES.replace("gyr_y", "gyro_x") + "0,0,0,0,0,0,1\n" * 2, "lacks columns of the rate"),
+        (NAMES.replace("time (s)", "gyro_x") + "0,0,0,0,0,0,1\n" * 2, "too many columns of the rate"),
+        (NAMES.replace("gyr_y", "gyr_y (deg/h)") + "0,0,0,0,0,0,1\n" * 2, "unit of the rate"),
     ],
 )
 def test_faults(tmp_path, text, message):
-    units = {} if message == "unit of the rate" else {"rate_unit": "rad/s", "force_unit": "g"}
+    units = {} if message.endswith("of the rate") else {"rate_unit": "rad/s", "force_unit": "g"}
     with pytest.raises(InputError, match=message):
         read_imu_table(write(tmp_path, text), **units)
 
@@ -69,6 +74,9 @@ def test_faults(tmp_path, text, message):
 def test_a_missing_file(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         read_imu_table(tmp_path / "no.csv")
+    (tmp_path / "latin.csv").write_bytes("größe;b\n1;2\n".encode("latin-1"))
+    with pytest.raises(InputError, match="UTF-8"):
+        read_imu_table(tmp_path / "latin.csv")
 
 
 def test_a_cut_last_line(tmp_path):

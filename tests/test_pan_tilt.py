@@ -104,11 +104,20 @@ def test_tables(tmp_path):
         read_encoder_table(path)
     with pytest.raises(InputError, match="cannot be read"):
         read_encoder_table(tmp_path / "no.csv")
+    for frames in ("0.5", "nan", "1e300"):
+        path.write_text(f"pan,tilt,frame\n1,2,0\n1,2,{frames}\n")
+        with pytest.raises(InputError, match="frames of the encoders"):
+            read_encoder_table(path)
+    path.write_text("")
+    with pytest.raises(InputError, match="empty"):
+        read_encoder_table(path)
 
 
 def test_faults():
     with pytest.raises(InputError, match="counts per turn"):
         PanTiltHead((0, 4096))
+    with pytest.raises(InputError, match="zero of the encoders"):
+        PanTiltHead((4096, 4096), zero=(np.nan, 0))
     with pytest.raises(InputError, match="directions"):
         PanTiltHead((4096, 4096), sign=(2, 1))
     with pytest.raises(InputError, match="shape"):
