@@ -39,7 +39,8 @@ def compare(
         typer.Option(
             metavar="METHODS",
             help="Some of fte, fte-plain (no parameters, table of noise), ekf, sba, sba-cameras (corrects "
-            "them too), tri, with commas between them; or 'all'.",
+            "them too), tri, with commas between them; or 'all'. With a lidar also fte-body, fte-nearest "
+            "(the thesis's depth) and fte-no-lidar.",
         ),
     ] = "all",
     holdout_cameras: Annotated[

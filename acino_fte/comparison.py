@@ -52,6 +52,10 @@ class Variant:
         Parameters it estimates; None for those that the data can tell.
     noise : str
         Measurement noise, ``"estimated"`` or the species' ``"table"``; means something to ``fte`` alone.
+    association : str
+        Of a lidar's returns (:data:`acino_fte.association.ASSOCIATIONS`); means something to ``fte`` alone.
+    lidar : bool
+        Whether it is about the lidar: not among ``all``, and refused without one.
     """
 
     name: str
@@ -60,12 +64,14 @@ class Variant:
     does: str
     fit: tuple[str, ...] | None = ()
     noise: str = "table"
+    association: str = "marker"
+    lidar: bool = False
 
     def options(self, problem: FTEOptions) -> EstimateOptions:
         """Options of its estimate."""
         from acino_fte.estimate import EstimateOptions
 
-        return EstimateOptions(problem=problem, fit=self.fit, noise=self.noise)
+        return EstimateOptions(problem=problem, fit=self.fit, noise=self.noise, association=self.association)
 
 
 VARIANTS: dict[str, Variant] = {
@@ -97,6 +103,19 @@ VARIANTS: dict[str, Variant] = {
             fit=("extrinsics",),
         ),
         Variant("tri", "Triangulation", "tri", "robust triangulation, every marker and frame on its own"),
+        *(
+            Variant(f"fte-{name}", f"FTE, {title}", "fte", does, None, "estimated", association, lidar=True)
+            for name, title, association, does in (
+                ("body", "whole body", "body", "FTE with every return on the body (--association body)"),
+                (
+                    "nearest",
+                    "nearest return",
+                    "nearest",
+                    "FTE with the thesis's depth: of the nearest return",
+                ),
+                ("no-lidar", "no lidar", "none", "FTE from the image alone (--association none)"),
+            )
+        ),
     )
 }
 """All variants by name, in the order of the table."""
@@ -211,7 +230,7 @@ class Block:
 
 
 def choose(text: str) -> list[Variant]:
-    """``"fte,tri"`` as variants, in the order given; ``"all"`` for every one.
+    """``"fte,tri"`` as variants, in the order given; ``"all"`` for all but those about a lidar.
 
     Raises
     ------
@@ -220,7 +239,7 @@ def choose(text: str) -> list[Variant]:
     """
     names = list(dict.fromkeys(word.strip().lower() for word in text.split(",") if word.strip()))
     if names == ["all"]:
-        return list(VARIANTS.values())
+        return [variant for variant in VARIANTS.values() if not variant.lidar]
     known = f"'all', or some of {', '.join(VARIANTS)} with commas between them"
     for name in names:
         if name not in VARIANTS:
@@ -267,6 +286,8 @@ def apply_variant(
     from acino_fte.methods import estimate
 
     options = variant.options(problem)
+    if variant.lidar and sequence.lidar is None:
+        return refusal(variant, InputError("The sequence has no lidar.", remedy="leave this method out"))
     try:
         result = estimate(variant.method, sequence, kinematics, options, progress=progress)
     except InputError as error:

@@ -59,6 +59,22 @@ def test_a_run_may_leave_the_lidar_out(folder, tmp_path):
     assert "the lidar is not used" in done.output
 
 
+def test_ways_to_use_the_lidar_are_compared(folder, tmp_path):
+    """With a lidar, the thesis's nearest return stands beside the default; without one it is refused."""
+    out = tmp_path / "out"
+    given = ["compare", str(folder), "--methods", "fte,fte-nearest", "-o", str(out)]
+    done = CliRunner().invoke(app, given)
+    assert done.exit_code == 0, done.output
+    rows = (out / "comparison.csv").read_text().splitlines()
+    assert len(rows) == 3 and "fte-nearest" in rows[2]
+    edited(folder, "lidar:\n", "lidar: null\nold:\n")
+    text = (folder / "sequence.yaml").read_text()
+    (folder / "sequence.yaml").write_text(text[: text.index("lidar: null")])
+    done = CliRunner().invoke(app, [*given[:2], "--methods", "fte-nearest", "-o", str(tmp_path / "none")])
+    assert done.exit_code == 2
+    assert "no lidar" in done.output
+
+
 def edited(folder, old, new):
     path = folder / "sequence.yaml"
     text = path.read_text()
