@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from acino_fte.cli_common import reported_errors, stdout, warn
+from acino_fte.cli_common import reported_errors, spinner, stdout, warn
 
 if TYPE_CHECKING:
     from acino_fte.rig_options import RigOptions
@@ -139,7 +139,7 @@ def simulate_rig(
     latency_ms: Annotated[float, _say("Random part of the way to the computer.", _IMU, min=0.0)] = 1.0,
     recording: Annotated[_Recording | None, _say("Also write the recording as a rig would.", _FILES)] = None,
     video: Annotated[_Video | None, _say("Also write the pictures as a video.", _FILES)] = None,
-    picture_width: Annotated[int, _say("Of the pictures, px.", _FILES, min=16)] = 512,
+    picture_width: Annotated[int, _say("Of the pictures, px.", _FILES, min=16, max=8192)] = 512,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same recording.")] = 0,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier simulation in OUT.")
@@ -157,14 +157,16 @@ def simulate_rig(
     from acino_fte.simulate_rig import simulate_rig as run_simulation
     from acino_fte.simulation_files import check_target
 
-    with reported_errors():
+    with reported_errors(), spinner(False) as tell:
         check_target(out, overwrite=overwrite)
         given |= {key: given.pop(flag.replace("-", "_")) for key, flag in _FLAGS.items()}
         beside = {key: given.pop(key) for key in _BESIDE}
         given = {key: value for key, value in given.items() if key not in ("out", "overwrite")}
         given |= {"noise_px": _parse_noise(noise_px), "lidar": lidar.value, "body": body.value}
         options = RigOptions(**given)
+        tell("simulating")
         simulation = run_simulation(options)
+        tell("writing")
         write_rig_simulation(
             simulation,
             out,
@@ -174,10 +176,10 @@ def simulate_rig(
             overwrite=overwrite,
             command=_command(out, options, beside),
         )
-        for note in simulation.notes:
-            warn(note)
-        returns = f"{len(simulation.lidar)} returns" if simulation.lidar is not None else "no lidar"
-        stdout.print(f"[bold]{escape(str(out))}[/]: {frames} frames, {returns}, truth")
+    for note in simulation.notes:
+        warn(note)
+    returns = f"{len(simulation.lidar)} returns" if simulation.lidar is not None else "no lidar"
+    stdout.print(f"[bold]{escape(str(out))}[/]: {frames} frames, {returns}, truth")
 
 
 def _command(out: Path, options: RigOptions, beside: dict[str, Any]) -> str:

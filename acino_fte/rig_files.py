@@ -11,6 +11,7 @@ import numpy as np
 
 from acino_fte.cameras import CameraArray
 from acino_fte.data_tools.recording import ImuSamples
+from acino_fte.errors import InputError
 from acino_fte.lidar import Lidar
 from acino_fte.rig_clocks import CAMERA_START, LIDAR_START, UNIX_START, FrameStamps
 from acino_fte.rig_recording import Recording, VideoFormat, write_recording
@@ -73,7 +74,7 @@ def write_rig_simulation(
     video : {"mp4", "mkv"}, optional
         Pictures as a video.
     picture_width : int
-        Of the pictures, px.
+        Of the pictures, px, from 16 to 8192.
     overwrite : bool
         Replace an earlier simulation there. Nothing else is ever replaced.
     command : str, optional
@@ -84,6 +85,13 @@ def write_rig_simulation(
     InputError
         The folder exists and is not to be replaced, cannot be made, or a library is missing.
     """
+    if not 16 <= picture_width <= 8192:
+        raise InputError(
+            "The width of the pictures is wrong.",
+            key="picture_width",
+            expected="px, from 16 to 8192",
+            found=str(picture_width),
+        )
     folder = check_target(folder, overwrite=overwrite)
     command = command or "acino_fte.simulate_rig.simulate_rig (from Python)"
     with whole_folder(folder) as work:

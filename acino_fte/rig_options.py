@@ -13,6 +13,7 @@ from acino_fte.simulation_options import PRIOR_MOTION
 
 FULL_WIDTH, FULL_HEIGHT = 2048, 1088  # px, of the sensor
 PITCH = 5.5e-6  # m, of its pixels at full width
+_MOST_JITTER = 0.1  # of the time of a frame
 _CHOICES = {"body": ("links", "capsules"), "lidar": ("scan", "pseudo", "none")}
 
 
@@ -162,6 +163,14 @@ class RigOptions:
         for key, known in _CHOICES.items():
             if getattr(self, key) not in known:
                 raise _wrong(self, key, " or ".join(f"'{k}'" for k in known))
+        if 1e-6 * self.jitter_us * self.fps > _MOST_JITTER:
+            raise InputError(
+                "The stamps of the frames would not be in order.",
+                key="jitter_us",
+                expected=f"at most {1e6 * _MOST_JITTER / self.fps:g} µs, a tenth of a frame's time",
+                found=f"{self.jitter_us:g} µs",
+                remedy="less jitter, or fewer frames per second",
+            )
         if self.motion == PRIOR_MOTION:
             raise InputError(
                 "A motion drawn from the prior is known at the frames only, but a lidar sees between them.",
@@ -244,7 +253,8 @@ def _check(options: RigOptions, key: str, lower: float, upper: float, expected: 
     whole = next(f.type for f in fields(options) if f.name == key) == "int"
     right = isinstance(value, (int, np.integer) if whole else (int, float, np.number))
     if isinstance(value, bool) or not right or not lower <= value <= upper:
-        raise _wrong(options, key, expected)
+        most = f"; at most {upper:,.15g}" if math.isfinite(upper) and " to " not in expected else ""
+        raise _wrong(options, key, expected + most)
 
 
 def _wrong(options: RigOptions, key: str, expected: str) -> InputError:

@@ -359,7 +359,8 @@ def test_long_runs_are_told_of():
 @pytest.mark.parametrize(
     ("key", "value"),
     [("background", 1.5), ("n_frames", 0), ("n_frames", 2.0), ("lidar", "radar"), ("body", "fur"),
-     ("noise_px", -1.0), ("distance", float("nan")), ("motion", "prior"), ("drops", 1.0), ("seed", True)],
+     ("noise_px", -1.0), ("distance", float("nan")), ("motion", "prior"), ("drops", 1.0), ("seed", True),
+     ("jitter_us", 3000.0)],
 )  # fmt: skip
 def test_wrong_options_are_named(key, value):
     with pytest.raises(InputError) as error:

@@ -232,6 +232,7 @@ def test_wrong_input_is_told_and_nothing_is_written(run, simulation, tmp_path):
     assert result.exit_code == 2
     assert "did you mean 'cheetah'" in result.output
     assert run(tmp_path / "x", "--noise-px", "much").exit_code == 2
+    assert run(tmp_path / "x", "--picture-width", 1_000_000).exit_code == 2
     assert run(tmp_path / "x", "--motion", "fly", "--frames", 2).exit_code == 2
     mine = tmp_path / "mine"
     mine.mkdir()
