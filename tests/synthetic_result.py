@@ -1,4 +1,4 @@
-"""A small FTEResult without a solver: a cheetah gallops past a row of cameras."""
+"""A small FTEResult without a solver: a cheetah, or another animal, gallops past a row of cameras."""
 
 from dataclasses import replace
 
@@ -40,9 +40,10 @@ def gallop(skeleton, n_frames, speed=13.0):
             swing = min(0.25 * (dof.upper - dof.lower), 0.45)
             centre = np.clip(0.0, dof.lower + 1.2 * swing, dof.upper - 1.2 * swing)
             q[:, j] = centre + swing * np.sin(2 * np.pi * 3.0 * time + 1.3 * j)
-    q[:, skeleton.dof("head.x")] = speed * time
-    q[:, skeleton.dof("head.z")] = 0.85 + 0.05 * np.sin(2 * np.pi * 3.0 * time)
-    q[:, skeleton.dof("head.yaw")] = 0.15 * np.sin(2 * np.pi * 0.5 * time)
+    root = skeleton.dofs[0].name.partition(".")[0]
+    q[:, skeleton.dof(f"{root}.x")] = speed * time
+    q[:, skeleton.dof(f"{root}.z")] = 0.85 + 0.05 * np.sin(2 * np.pi * 3.0 * time)
+    q[:, skeleton.dof(f"{root}.yaw")] = 0.15 * np.sin(2 * np.pi * 0.5 * time)
     return q
 
 
@@ -57,9 +58,10 @@ def make_result(
     truth=True,
     seed=0,
     warnings=(),
+    kinematics=None,
 ):
-    skeleton = load_skeleton("cheetah")
-    kinematics = load_kinematics(skeleton)
+    kinematics = kinematics or load_kinematics(load_skeleton("cheetah"))
+    skeleton = kinematics.skeleton
     rng = np.random.default_rng(seed)
     q = gallop(skeleton, n_frames)
     positions = kinematics.positions(q)
@@ -87,12 +89,12 @@ def make_result(
     )
     sequence = Sequence(
         name="gallop",
-        species="cheetah",
+        species=skeleton.name,
         fps=FPS,
         detections=detections,
         cameras=cameras,
         truth=true if truth else None,
-        provenance={"species": "cheetah", "fps": FPS, "frames": [start, start + n_frames]},
+        provenance={"species": skeleton.name, "fps": FPS, "frames": [start, start + n_frames]},
         warnings=tuple(warnings),
     )
     dq = np.gradient(q, 1 / FPS, axis=0) if n_frames > 1 else np.zeros_like(q)
@@ -133,7 +135,11 @@ def with_estimates(result, seed=1):
         "segment_scale_sd": {g: 0.005 + 0.001 * i for i, g in enumerate(result.skeleton.groups)},
         "extrinsics": {name: turn for name in names[1:]},
         "extrinsics_sd": {name: spread for name in names[1:]},
-        "marker_offset_m": {name: list(0.01 * rng.normal(0, 1, 3)) for name in ("spine", "nose")},
+        "marker_offset_m": {
+            name: list(0.01 * rng.normal(0, 1, 3))
+            for name in ("spine", "nose")
+            if name in result.skeleton.marker_names
+        },
         "noise_px": {x.name: x.sd_px * rng.uniform(0.7, 2.5) for x in result.skeleton.markers},
     }
     return replace(

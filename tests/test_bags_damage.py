@@ -59,7 +59,7 @@ def ends_ros1(path: Path) -> list[tuple[int, int]]:
         entries = [entry for index in reader.indexes.values() for entry in index]
         for position, chunk in reader.chunks.items():
             packed = data[chunk.datapos : chunk.datapos + chunk.datasize]
-            plain = chunk.decompressor(packed)
+            plain, there = chunk.decompressor(packed), given(packed)
             ends = []
             for entry in (e for e in entries if e.chunk_pos == position):
                 at = entry.offset
@@ -71,12 +71,12 @@ def ends_ros1(path: Path) -> list[tuple[int, int]]:
                     if message:
                         break
                 ends.append(at)
-            needed += [(chunk.datapos + given(data, packed, end), 1) for end in ends]
+            needed += [(chunk.datapos + int(np.searchsorted(there, end)), 1) for end in ends]
     return needed
 
 
-def given(data: bytes, packed: bytes, end: int) -> int:
-    """How many packed bytes the decompressor needs to give `end` bytes."""
+def given(packed: bytes) -> np.ndarray:
+    """How many bytes the decompressor gives of the first 0, 1, 2, … packed bytes."""
     if packed.startswith(b"BZh"):
         unpack = bz2.BZ2Decompressor()
     elif packed.startswith(b"\x04\x22\x4d\x18"):
@@ -84,13 +84,8 @@ def given(data: bytes, packed: bytes, end: int) -> int:
 
         unpack = lz4.frame.LZ4FrameDecompressor()
     else:
-        return end
-    out = 0
-    for i in range(len(packed)):
-        out += len(unpack.decompress(packed[i : i + 1]))
-        if out >= end:
-            return i + 1
-    raise AssertionError
+        return np.arange(len(packed) + 1)
+    return np.cumsum([0, *(len(unpack.decompress(packed[i : i + 1])) for i in range(len(packed)))])
 
 
 def make_mcap(path: Path, compression: str) -> list[tuple[int, int]]:

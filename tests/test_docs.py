@@ -1,7 +1,8 @@
 """README and docs do what they say: every command and Python snippet runs, in order.
 
 The two set-up commands install, which a test must not do; ``.ci/run`` does it, and here only what follows
-``&&`` runs. The first of them draws figures; later runs do without, to save time.
+``&&`` runs, in this process (that the script starts as a program is a matter of test_run_cli). The first of
+them draws figures; later runs do without, to save time.
 ``docs/new_species.md``, ``match_tracks.md``, ``moving_cameras.md`` and ``lidar.md`` have tests of their own,
 test_…_tutorial.
 """
@@ -91,8 +92,11 @@ def follow(page: Path, folder: Path) -> None:
             for line in filter(str.strip, text.splitlines()):
                 if line == SET_UP[1]:
                     continue  # this is it
-                quick = " --no-figures" if line.startswith(_NO_FIGURES) else ""
-                execute(line.split("&&")[1] if line == SET_UP[0] else line + quick, folder)
+                if line == SET_UP[0]:
+                    line = line.partition("&& ")[2].replace("python scripts/run_fte.py", "acino-fte run")
+                elif line.startswith(_NO_FIGURES):
+                    line += " --no-figures"
+                execute(line, folder)
         elif language == "python":
             exec(compile(text, f"{page.name}: {text.splitlines()[0]}", "exec"), names)
 
@@ -102,8 +106,8 @@ def test_a_page_runs_from_top_to_bottom(page: Path, folder: Path) -> None:
     follow(page, folder)
     if page.name == "README.md":
         result = folder / "out" / "cheetah_gallop"
-        assert set(FILES) == {path.name for path in result.iterdir()}
-        drawn = {f"{name}.{kind}" for name in set(FIGURES) - {"ladder"} for kind in ("png", "pdf")}
+        assert set(FILES) - {"depth.csv"} == {path.name for path in result.iterdir()}
+        drawn = {f"{name}.{kind}" for name in set(FIGURES) - {"depth", "ladder"} for kind in ("png", "pdf")}
         assert drawn == {path.name for path in (result / "figures").iterdir()}
         metrics = json.loads((result / "metrics.json").read_text())
         assert metrics["status"] == "converged"
