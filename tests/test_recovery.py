@@ -55,16 +55,19 @@ def theta_of(parameters, values):
     return theta
 
 
-def parameter_nees(result, kinematics, options, fit):
-    """eᵀ Σ⁻¹ e of the parameters of the last of the families, and how many they are."""
+def parameter_nees(result, kinematics, options, fit, scored):
+    """eᵀ Σ⁻¹ e of the parameters of each family that is scored, and how many they are."""
     noise = np.array(list(result.parameters["noise_px"].values()))
     assumed = Assumptions(pixels=result.observed, sd_px=noise)
     problem = build_fte(result.sequence, kinematics, replace(options, fit=fit), assumed)
     theta = theta_of(problem.parameters, result.parameters)
     covariance = posterior(problem, Minimum(Status.CONVERGED, result.q, 0.0, 0, theta)).theta
-    places = problem.parameters.of_family(fit[-1])
-    error = (theta - theta_of(problem.parameters, result.sequence.truth_parameters))[places]
-    return float(error @ np.linalg.solve(covariance[np.ix_(places, places)], error)), len(places)
+    error = theta - theta_of(problem.parameters, result.sequence.truth_parameters)
+    found = []
+    for places in map(problem.parameters.of_family, scored):
+        squared = error[places] @ np.linalg.solve(covariance[np.ix_(places, places)], error[places])
+        found.append((float(squared), len(places)))
+    return found
 
 
 # --- poses of cameras --------------------------------------------------------------------------------
@@ -212,7 +215,7 @@ def test_everything_together_of_a_gallop(cheetah):
         found = camera_errors(result, simulation)
         assert found.millimetres < 2.5 * bound.millimetres
         assert found.degrees < 2.5 * bound.degrees
-        squared, dimensions = parameter_nees(result, cheetah, FTEOptions(), FIT)
+        ((squared, dimensions),) = parameter_nees(result, cheetah, FTEOptions(), FIT, FIT[-1:])
         nees, count = nees + squared, count + dimensions
     assert count == 60
     assert chi2.ppf(0.001, count) < nees < chi2.ppf(0.999, count), nees / count
