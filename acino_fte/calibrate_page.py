@@ -146,7 +146,6 @@ def _save(
     """Write the calibration, and its report where there are pictures for it."""
     from acino_fte.data_tools.lidar_camera import write_lidar_camera
 
-    out.parent.mkdir(parents=True, exist_ok=True)
     write_lidar_camera(out, calibration.lidar_camera)
     if pictures is None:
         return (out,)

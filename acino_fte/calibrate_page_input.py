@@ -105,7 +105,7 @@ def read_placements(images: Sequence[Path], clouds: Sequence[Path]) -> list[Plac
         raise InputError(
             "Every image needs its point cloud.",
             key="--cloud",
-            expected=f"1 cloud, or {len(images)}: one for each image, in their order",
+            expected="1 cloud" + (f", or {len(images)}: one for each image, in order" * (len(images) > 1)),
             found=str(len(clouds)),
             remedy="give --cloud once for every image",
         )

@@ -69,6 +69,7 @@ def calibrate_lidar(
     Camera matrix and pose are estimated together, without a guess; distortion where the pairs support it.
     """
     with reported_errors():
+        _check_out(out, [*(images or ()), *(cloud or ()), *filter(None, (pairs, camera))])
         lens = _lens(camera)
         if resolution is None and images:
             from acino_fte.calibrate_page import serve
@@ -131,7 +132,6 @@ def calibrate_from_pairs(
     calibration = solve_lidar_camera(found, resolution, camera, fit, focal_px=focal_px)
     for message in calibration.messages:
         warn(message)
-    out.parent.mkdir(parents=True, exist_ok=True)
     write_lidar_camera(out, calibration.lidar_camera)
     lines = [
         f"{int(calibration.counted.sum())} of {found.n_used} pairs count",
@@ -147,6 +147,21 @@ def calibrate_from_pairs(
     for line in lines:
         stdout.print(line, markup=False)
     return calibration
+
+
+def _check_out(out: Path, inputs: list[Path]) -> None:
+    """Raise InputError where the calibration would take the place of what it comes from, or of a folder."""
+    if any(out.resolve() == path.resolve() for path in inputs):
+        raise InputError(
+            "The calibration would be written over what it is made from.",
+            file=out,
+            key="--out",
+            remedy="give it another name, as lidar_camera.json",
+        )
+    if out.is_dir():
+        raise InputError(
+            "There is a folder of that name.", file=out, key="--out", remedy=f"{out / 'lidar_camera.json'}"
+        )
 
 
 def _lens(path: Path | None) -> Camera | None:
@@ -173,6 +188,10 @@ def _resolution(text: str | None, camera: Camera | None) -> tuple[int, int]:
 
 def _fit(text: str) -> tuple[str, ...] | str:
     names = tuple(name.strip().lower() for name in text.split(",") if name.strip())
+    if not names:
+        raise InputError(
+            "Nothing is said of what to fit.", key="--fit", expected="auto, pose, or f, aspect, c, distortion"
+        )
     if names == ("auto",):
         return "auto"
     return () if names == ("pose",) else names

@@ -16,10 +16,12 @@ belongs into an object outside of it. See :mod:`acino_fte.local_page_guard` for 
 from __future__ import annotations
 
 import json
+import signal
 import socket
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -52,7 +54,8 @@ class PageSession:
     url : str
         Address of the page without its token.
     ending : str
-        Why the page ended: ``"done"``, ``"interrupted"`` (Ctrl-C) or ``"browser closed"``.
+        Why the page ended: ``"done"``, ``"interrupted"`` (Ctrl-C, or the process was asked to end) or
+        ``"browser closed"``.
     """
 
     title: str
@@ -176,7 +179,8 @@ def serve_page(
     server.ready = ready
     session._stop = lambda: setattr(server, "should_exit", True)
     try:
-        server.run(sockets=[listener])
+        with _asked_to_end(session._stop):
+            server.run(sockets=[listener])
     except KeyboardInterrupt:
         session.ending = "interrupted"
     finally:
@@ -184,6 +188,20 @@ def serve_page(
         for action in session._endings:
             action()
     return session.ending
+
+
+@contextmanager
+def _asked_to_end(stop: Callable[[], None]) -> Iterator[None]:
+    """Let SIGTERM and SIGHUP (a terminal that is closed) end the page as Ctrl-C does: all is tidied up."""
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        names = []
+    before = {name: signal.signal(getattr(signal, name), lambda *_: stop()) for name in names}
+    try:
+        yield
+    finally:
+        for name, handler in before.items():
+            signal.signal(getattr(signal, name), handler)
 
 
 def _listen(port: int) -> socket.socket:

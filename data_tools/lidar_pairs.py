@@ -7,6 +7,7 @@ import io
 import json
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from secrets import token_hex
@@ -192,7 +193,13 @@ def read_lidar_pairs(path: Path | str) -> LidarPairs:
     except FileNotFoundError:
         raise InputError("The file of pairs does not exist.", file=path, remedy="check the path") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError("The file of pairs cannot be read.", file=path, found=str(error)) from None
+        raise InputError(
+            "The file of pairs cannot be read.",
+            file=path,
+            expected="CSV or JSON, as text (UTF-8)",
+            found=str(error),
+            remedy="check the path; a spreadsheet saves such a file as CSV UTF-8",
+        ) from None
     rows = _json_rows(text, path) if text.lstrip()[:1] in ("{", "[") else _csv_rows(text, path)
     numbers = np.array([[_number(row, key, path) for key in _NUMBERS] for _, row in rows]).reshape(-1, 5)
     try:
@@ -348,4 +355,5 @@ def write_text_whole(path: Path, text: str) -> None:
     except OSError as error:
         raise InputError("The file cannot be written.", file=path, found=str(error)) from error
     finally:
-        working.unlink(missing_ok=True)
+        with suppress(OSError):  # of a folder that is none
+            working.unlink(missing_ok=True)

@@ -28,6 +28,9 @@ RIG, ANYWHERE = 0.5, 50.0
 """How far a camera is from its lidar, m (standard deviation of each coordinate): on a rig, or anywhere."""
 _CENTRE = 0.02  # how far the principal point is from the middle, in widths of the image
 _FINALISTS = 2  # starts that are followed to the end
+_WORST = 0.1  # of the width of the image: picks farther off than that say nothing
+_NO_POSE = "No pose was found that these pairs agree with."
+_LOOK = "check that pixels and points belong together and that all images have one zoom"
 _LENS = {"log_aspect": 0.02, "k1": 0.5, "k2": 1.0}
 
 
@@ -171,6 +174,7 @@ def solve_lidar_camera(
     best = min(fits, key=_evidence)
     if fit == "auto" and camera is None:
         best = choose_lens(best, pixel, xyz, noise)
+    _check_fits(best, noise)
     return _calibration(pairs, used, best, pixel, xyz, noise)
 
 
@@ -290,12 +294,22 @@ def _best_fit(
     problem = (names, pixel, xyz, noise, priors)
     rough = [robust_fit(guess, *problem, rough=True) for guess in guesses]
     if not rough:
-        raise InputError(
-            "No pose was found that these pairs agree with.",
-            remedy="check that pixels and points belong together and that all images have one zoom",
-        )
+        raise InputError(_NO_POSE, remedy=_LOOK)
     fits = [robust_fit(fit.camera, *problem) for fit in sorted(rough, key=lambda fit: fit.scale)[:_FINALISTS]]
     return min((polished(fit.camera, *problem, fit.scale) for fit in fits), key=_evidence)
+
+
+def _check_fits(fit: Fit, noise: PickNoise) -> None:
+    """Raise InputError where the best there is fits nothing."""
+    off, width = fit.scale * noise.pixel, fit.camera.resolution[0]
+    seen = int(np.isfinite(fit.residual).all(axis=1).sum())
+    if off > _WORST * width or 2 * seen < len(fit.residual):
+        raise InputError(
+            _NO_POSE,
+            expected=f"most pairs before the camera, and picks much nearer than {_WORST * width:.0f} px",
+            found=f"{seen} of {len(fit.residual)} before it, about {off:.0f} px off",
+            remedy=_LOOK,
+        )
 
 
 def _evidence(fit: Fit) -> float:

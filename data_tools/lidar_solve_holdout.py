@@ -18,11 +18,10 @@ def left_out(fit: Fit) -> np.ndarray:
     The deleted residual of least squares, (1 − H_ii)⁻¹ r_i, with H the hat matrix (Cook and Weisberg 1982,
     section 2.2.1); of a pair without weight the residual itself.
     """
-    white = fit.whiten @ np.nan_to_num(fit.slope)
+    white = fit.white
     weight = (fit.weight / fit.scale**2)[:, None, None]
     hat = weight * (white @ fit.covariance @ white.transpose(0, 2, 1))
-    error = np.einsum("pij,pj->pi", fit.whiten, np.nan_to_num(fit.residual))
-    deleted = np.linalg.solve(np.eye(2) * (1.0 + 1e-9) - hat, error[..., None])
+    deleted = np.linalg.solve(np.eye(2) * (1.0 + 1e-9) - hat, fit.error[..., None])
     known = np.isfinite(fit.residual).all(axis=1) & (np.abs(fit.whiten).sum(axis=(1, 2)) > 0)
     out = fit.residual.copy()
     out[known] = np.linalg.solve(fit.whiten[known], deleted[known])[..., 0]

@@ -15,6 +15,7 @@ from acino_fte.cameras import Camera
 from acino_fte.data_tools.rotations import cross_matrix, rotation_matrix
 
 POSE = ("rotation_x", "rotation_y", "rotation_z", "translation_x", "translation_y", "translation_z")
+_BOUNDLESS = 1e12  # px²
 LENS = ("log_f", "log_aspect", "cx", "cy", "k1", "k2")
 
 
@@ -141,8 +142,11 @@ def pick_covariance(for_point: np.ndarray, xyz: np.ndarray, noise: PickNoise) ->
 
 
 def whitening(covariance: np.ndarray) -> np.ndarray:
-    """W (P, 2, 2) with Wᵀ W the inverse of covariances (P, 2, 2); 0 where they are not numbers."""
-    known = np.isfinite(covariance).all(axis=(1, 2))
+    """W (P, 2, 2) with Wᵀ W the inverse of covariances (P, 2, 2); 0 where they are no numbers, or as good as.
+
+    Of a point beside the camera, nearly 90° from its axis, the covariance is so large that it has no inverse.
+    """
+    known = np.isfinite(covariance).all(axis=(1, 2)) & (np.abs(covariance) < _BOUNDLESS).all(axis=(1, 2))
     out = np.zeros_like(covariance)
     out[known] = np.linalg.inv(np.linalg.cholesky(covariance[known]))
     return out

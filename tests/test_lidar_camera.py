@@ -301,4 +301,10 @@ def test_the_command_calibrates_and_reports(tmp_path):
     )
     for wrong in (["0x3"], ["2048x1088", "--focal", "long"], ["2048x1088", "--fit", "zoom"], ["800x600"]):
         assert CliRunner().invoke(app, [*arguments, *wrong]).exit_code == 2
+    kept = (tmp_path / "picks.csv").read_bytes()
+    for place in ("picks.csv", ".", "picks.csv/cal.json"):  # over the pairs, a folder, within a file
+        done = CliRunner().invoke(
+            app, [*arguments, "2048x1088", "--fit", "f", "--no-report", "-o", str(tmp_path / place)]
+        )
+        assert done.exit_code == 2 and (tmp_path / "picks.csv").read_bytes() == kept, place
     assert CliRunner().invoke(app, []).exit_code == 2

@@ -172,3 +172,29 @@ def test_pairs_that_make_no_calibration():
     assert "another size" in message(solve_lidar_camera, picks, RESOLUTION, lens).problem
     wide = replace(lens, resolution=RESOLUTION)
     assert "distortion" in message(solve_lidar_camera, picks, RESOLUTION, wide, ("distortion",)).problem
+
+
+def test_pairs_that_do_not_belong_together_are_refused():
+    """Nothing is written of a calibration that fits nothing, or that has most places behind the camera."""
+    rng = np.random.default_rng(0)
+    pixel = rng.uniform(0, np.array(RESOLUTION) - 1, (20, 2))
+    error = message(solve_lidar_camera, LidarPairs(pixel, rng.uniform(-50, 50, (20, 3))), RESOLUTION)
+    assert "No pose was found" in error.problem and "px off" in error.found
+
+
+def test_a_point_beside_the_camera_counts_as_not_seen():
+    """Its covariance has no inverse; the pair is lost, not the calibration."""
+    xyz = np.array([[1.0, 2.0, 5.0], [1.0, 0.5, 1e-14]])
+    camera = Camera("c", "pinhole", np.diag([900.0, 900, 1]), np.zeros(5), np.eye(3), np.zeros(3), RESOLUTION)
+    fit = at(camera, POSE, np.zeros((2, 2)), xyz, PickNoise(), Priors({}, {}))
+    assert np.isfinite(fit.residual).all(axis=1).tolist() == [True, False]
+    assert np.isfinite(fit.information).all() and fit.squared[1] > 1e5
+
+
+def test_without_outliers_it_is_least_squares():
+    """As sure as the noise lets it be: no weight is lost on pairs that are only a little off."""
+    picks = simulated_picks(5.0, "scene", 14, 2)
+    found = solve_lidar_camera(picks.pairs, RESOLUTION)
+    names, noise = (*POSE, "log_f", "cx", "cy"), PickNoise()
+    fit = polished(picks.camera, names, picks.pairs.pixel, picks.pairs.xyz, noise, Priors({}, {}), 1.0)
+    assert (fit.weight == 1).all() and not found.outlier.any()

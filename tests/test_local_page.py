@@ -150,9 +150,11 @@ def test_it_listens_on_this_computer_only(server):
             socket.create_connection((address, port), timeout=0.5).close()
 
 
-def test_ctrl_c_ends_it_quietly():
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_ends_it_quietly(name):
+    """Ctrl-C, a process that is asked to end, a terminal that is closed: what is to be tidied is."""
     with served("-c", PAGE) as running:
-        running.process.send_signal(signal.SIGINT)
+        running.process.send_signal(getattr(signal, name))
         text, _ = running.process.communicate(timeout=10)
         assert running.process.returncode == 0
         assert "Traceback" not in text
