@@ -10,7 +10,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich.markup import escape
 
@@ -18,6 +17,8 @@ from acino_fte.cli_common import reported_errors, spinner, stdout, warn
 from acino_fte.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from acino_fte.data_tools.camera_motion import CameraMotion
     from acino_fte.data_tools.camera_motion_input import EncoderCounts
     from acino_fte.data_tools.imu import Attitude
@@ -293,6 +294,8 @@ def _from_video(
     sequence: Sequence, name: str, file: Path, model: str, tell: Callable[[str], None]
 ) -> CameraMotion:
     """By the pictures; the animal's own keypoints are masked out."""
+    import numpy as np
+
     from acino_fte.data_tools.odometry import visual_odometry
     from acino_fte.data_tools.odometry_features import keypoint_boxes
     from acino_fte.data_tools.pictures import open_pictures
@@ -307,6 +310,8 @@ def _from_video(
 def _from_encoders(
     sequence: Sequence, read: EncoderCounts, head: tuple[Any, ...], start: float
 ) -> CameraMotion:
+    import numpy as np
+
     from acino_fte.data_tools.pan_tilt import PanTiltHead, motion_from_encoders
 
     counts, time, frame = read.counts, read.time, read.frame
@@ -334,6 +339,8 @@ def _from_imu(
     tell: Callable[[str], None],
 ) -> CameraMotion:
     """By the inertial sensor, levelled by gravity; its first heading is where the camera looks."""
+    import numpy as np
+
     from acino_fte.data_tools.imu_camera import motion_from_attitude
     from acino_fte.data_tools.imu_filter import gravity_attitude
 
@@ -355,6 +362,8 @@ def _mounting(
     mount: tuple[str, Path | None],
     tell: Callable[[str], None],
 ) -> Mounting:
+    import numpy as np
+
     from acino_fte.data_tools.imu_camera import Mounting, find_mounting
 
     said, video = mount
@@ -372,6 +381,8 @@ def _mounting(
 
 def _rotation_file(path: Path) -> np.ndarray:
     """A 3×3 rotation from a JSON file: the bare rows, or under 'imu_to_camera'."""
+    import numpy as np
+
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         matrix = np.asarray(data["imu_to_camera"] if isinstance(data, dict) else data, dtype=float)
