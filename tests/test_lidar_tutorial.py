@@ -99,9 +99,14 @@ def test_errors_are_as_the_page_says(followed):
     for how, promised in rows.items():
         assert found[how] == pytest.approx(float(promised), rel=0.3), how
     assert 2 * found["marker"] < found["nearest"] < found["none"]
+    readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    assert re.search(r"(\d+) mm on average; without the lidar to (\d+) mm", readme).groups() == (
+        rows["marker"],
+        rows["none"],
+    )
     pixels = [metrics_of(folder, name)["reprojection_px"]["median"] for name in names.values()]
     assert max(pixels) < 1.1 * min(pixels)  # pictures do not show it
-    assert any("one camera and no lidar" in f for f in metrics_of(folder, "field_alone")["findings"])
+    assert any("species' segment lengths" in f for f in metrics_of(folder, "field_alone")["findings"])
 
 
 def test_depth_csv_and_its_metrics_are_explained(followed):
