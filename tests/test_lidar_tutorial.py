@@ -29,6 +29,7 @@ PAGE = (DOCS / "lidar.md").read_text(encoding="utf-8")
 FORMATS = (DOCS / "sequence_format.md").read_text(encoding="utf-8")
 METRICS = (DOCS / "metrics.md").read_text(encoding="utf-8")
 _PLAIN = {"run": "--no-figures", "histograms": "--no-figures", "calibrate-lidar": "--no-report"}
+_NO_SPREAD = ("run hunt", "--association body")  # whose standard deviations nothing here looks at
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
@@ -43,8 +44,10 @@ def followed(tmp_path_factory):
         for language, block in blocks(PAGE):
             if language == "bash":
                 for line in filter(str.strip, block.splitlines()):
-                    plain = _PLAIN.get(line.split()[1])
-                    printed[line] = execute(f"{line} {plain}" if plain else line, folder)
+                    plain = _PLAIN.get(line.split()[1], "")
+                    if any(words in line for words in _NO_SPREAD):
+                        plain += " --no-covariance"
+                    printed[line] = execute(f"{line} {plain}", folder)
             elif language == "python":
                 exec(compile(block, f"lidar.md: {block.splitlines()[0]}", "exec"), names)
     return folder, printed, names
