@@ -18,13 +18,12 @@ from acino_fte.data_tools.bags_ros1 import Ros1Walk
 from acino_fte.data_tools.bags_serial import DecodeError, decode, definitions
 from acino_fte.data_tools.bags_sqlite import MAGIC as SQLITE_MAGIC
 from acino_fte.data_tools.bags_sqlite import SqliteWalk
-from acino_fte.data_tools.bags_window import Channel, Losses, RawMessage, decompressor
+from acino_fte.data_tools.bags_window import ZSTD, Channel, Losses, RawMessage, decompressor
 from acino_fte.data_tools.recording import GRAVITY, Damage, Kind, Record, Stream
 from acino_fte.data_tools.ros_messages import IMU_G_LIMIT, force_norm, from_message, kind_of
 from acino_fte.errors import InputError
 
 ImuUnit = Literal["auto", "g", "m/s2"]
-_ZSTD = b"\x28\xb5\x2f\xfd"
 _NOTHING = 0.05  # an acceleration so short (in any unit) tells nothing of its unit
 
 
@@ -133,10 +132,7 @@ class BagReader:
                 if walk is None:
                     continue
                 if walk.overview():
-                    channels: dict[int, Channel] = getattr(walk, "channels", {}) or getattr(
-                        walk, "connections", {}
-                    )
-                    for number, channel in channels.items():
+                    for number, channel in walk.channels.items():
                         key = (channel.topic, channel.type)
                         found[key] = found.get(key, 0) + walk.counts.get(number, 0)
                 else:
@@ -273,7 +269,7 @@ def bag_kind(path: Path) -> Literal["ros1", "mcap", "sqlite", "ecal", "zstd"] | 
         return "ros1"
     if head.startswith(MCAP_MAGIC):
         return "mcap"
-    if head.startswith(_ZSTD):
+    if head.startswith(ZSTD):
         return "zstd"
     if head.startswith(HDF5_MAGIC):
         return "ecal"

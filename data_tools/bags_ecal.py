@@ -15,21 +15,15 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from acino_fte.data_tools.bags_serial import CUSTOM
-from acino_fte.data_tools.bags_window import Channel, Losses, Messages, RawMessage
+from acino_fte.data_tools.bags_window import Channel, FileWalk, Losses, Messages, RawMessage
 from acino_fte.errors import InputError
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _REMEDY = "a recording that was cut has to be restored first; another HDF5 file is no recording"
 
 
-class EcalWalk:
+class EcalWalk(FileWalk):
     """Walks through one .hdf5 file of eCAL, in the order of its messages' numbers.
-
-    Parameters
-    ----------
-    path : Path
-    losses : Losses
-        Counts what is read and lost.
 
     Raises
     ------
@@ -38,9 +32,7 @@ class EcalWalk:
     """
 
     def __init__(self, path: Path, losses: Losses) -> None:
-        self.path, self.losses = path, losses
-        self.channels: dict[int, Channel] = {}
-        self.counts: dict[int, int] = {}
+        super().__init__(path, losses)
         self._tables: list[np.ndarray] = []
         with self._open() as file:
             names = self._names(file)

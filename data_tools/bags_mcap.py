@@ -14,6 +14,7 @@ from typing import Any
 from acino_fte.data_tools.bags_serial import LAYOUTS
 from acino_fte.data_tools.bags_window import (
     Channel,
+    FileWalk,
     FileWindow,
     Losses,
     Messages,
@@ -36,20 +37,11 @@ _OP = re.compile(rb"(?=[\x01-\x0f].{4}\0\0\0\0)", re.DOTALL)
 _COMPRESSIONS = (b"", b"lz4", b"zstd")
 
 
-class McapWalk:
-    """Walks through one MCAP file.
-
-    Parameters
-    ----------
-    path : Path
-    losses : Losses
-        Counts what is read and lost.
-    """
+class McapWalk(FileWalk):
+    """Walks through one MCAP file."""
 
     def __init__(self, path: Path, losses: Losses) -> None:
-        self.path, self.losses = path, losses
-        self.channels: dict[int, Channel] = {}
-        self.counts: dict[int, int] = {}
+        super().__init__(path, losses)
         self._schemas: dict[int, tuple[str, str, str]] = {}
         self._indexed = self._stated = 0
         self._payloads = self._done = False

@@ -16,6 +16,7 @@ from typing import Any
 from acino_fte.data_tools.bags_serial import ROS1
 from acino_fte.data_tools.bags_window import (
     Channel,
+    FileWalk,
     FileWindow,
     Losses,
     Messages,
@@ -43,14 +44,8 @@ _SCAN = 1 << 20
 _OP = re.compile(rb"\x04\0\0\0op=[\x02-\x07]", re.DOTALL)
 
 
-class Ros1Walk:
+class Ros1Walk(FileWalk):
     """Walks through one ROS 1 bag.
-
-    Parameters
-    ----------
-    path : Path
-    losses : Losses
-        Counts what is read and lost.
 
     Raises
     ------
@@ -59,9 +54,7 @@ class Ros1Walk:
     """
 
     def __init__(self, path: Path, losses: Losses) -> None:
-        self.path, self.losses = path, losses
-        self.connections: dict[int, Channel] = {}
-        self.counts: dict[int, int] = {}
+        super().__init__(path, losses)
         self._index_counts = self._info_counts = 0
         self._payloads = True
         self._file_end = path.stat().st_size
@@ -78,7 +71,7 @@ class Ros1Walk:
 
     def overview(self) -> bool:
         """Connections and counts from the index; whether there is a sound one."""
-        self.counts = {}
+        self.counts.clear()
         with self.path.open("rb") as file:
             window = FileWindow(file, self._file_end)
             window.seek(len(MAGIC))
@@ -104,7 +97,7 @@ class Ros1Walk:
                     for i in range(0, len(data) - 7, 8):
                         conn, n = struct.unpack_from("<II", data, i)
                         self.counts[conn] = self.counts.get(conn, 0) + n
-        return set(self.counts) <= set(self.connections)
+        return set(self.counts) <= set(self.channels)
 
     def _connections_at_end(self) -> None:
         """Connections of an index that is not where the head says."""
@@ -170,7 +163,7 @@ class Ros1Walk:
 
     def _message(self, fields: dict[bytes, bytes], data: bytes, place: str) -> Messages:
         conn = struct.unpack("<I", fields[b"conn"])[0]
-        channel = self.connections.get(conn)
+        channel = self.channels.get(conn)
         if channel is None:
             self.losses.note(f"the message at {place} is of the unknown connection {conn}", 1, len(data))
             return
@@ -184,7 +177,7 @@ class Ros1Walk:
         topic = (fields[b"topic"] or more.get(b"topic", b"")).decode("utf-8", "replace")
         definition = more.get(b"message_definition", b"").decode("utf-8", "replace")
         kind = type_name(more.get(b"type", b"").decode("utf-8", "replace"))
-        self.connections.setdefault(conn, Channel(topic, kind, definition, "ros2msg", ROS1, 1))
+        self.channels.setdefault(conn, Channel(topic, kind, definition, "ros2msg", ROS1, 1))
 
     def _chunk(self, window: Any, fields: dict[bytes, bytes], skip: int, length: int) -> Any:
         """Walk into a chunk. Of an uncompressed one the end is returned: its records are the file's."""
@@ -266,7 +259,7 @@ class Ros1Walk:
         op, fields, skip, length = head
         if op == _CHUNK:
             return not isinstance(window, Unpacked)
-        known = op != _MESSAGE or struct.unpack("<I", fields[b"conn"])[0] in self.connections
+        known = op != _MESSAGE or struct.unpack("<I", fields[b"conn"])[0] in self.channels
         return known and at + skip + length <= window.end
 
 

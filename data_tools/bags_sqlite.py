@@ -16,31 +16,29 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from acino_fte.data_tools.bags_serial import LAYOUTS
-from acino_fte.data_tools.bags_window import Channel, Losses, Messages, RawMessage, decompressor
+from acino_fte.data_tools.bags_window import (
+    ZSTD,
+    Channel,
+    FileWalk,
+    Losses,
+    Messages,
+    RawMessage,
+    decompressor,
+)
 from acino_fte.data_tools.ros_messages import type_name
 
 MAGIC = b"SQLite format 3\0"
-_ZSTD = b"\x28\xb5\x2f\xfd"
 _BROKEN = (sqlite3.Error, ValueError, OverflowError)  # what a damaged database makes SQLite's module raise
 _LEAF = 13
 _FIRST_PAGES = 64  # hold topics and definitions, as these are written first
 _INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
 
 
-class SqliteWalk:
-    """Walks through one .db3 file.
-
-    Parameters
-    ----------
-    path : Path
-    losses : Losses
-        Counts what is read and lost.
-    """
+class SqliteWalk(FileWalk):
+    """Walks through one .db3 file."""
 
     def __init__(self, path: Path, losses: Losses) -> None:
-        self.path, self.losses = path, losses
-        self.channels: dict[int, Channel] = {}
-        self.counts: dict[int, int] = {}
+        super().__init__(path, losses)
         self._log = path.with_name(path.name + "-wal")
         self._last = 0  # number of the last row that SQLite gave
 
@@ -116,7 +114,7 @@ class SqliteWalk:
             self.losses.note(f"a message is of the unknown topic {topic}", 1)
             return
         self.losses.read += 1
-        if data[:4] == _ZSTD:
+        if data[:4] == ZSTD:
             data = _unpacked(data)
         yield RawMessage(channel, stamp, data)
 

@@ -6,12 +6,15 @@ import bz2
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, BinaryIO
 
 from acino_fte.data_tools.bags_serial import Layout
 from acino_fte.data_tools.recording import Damage
 from acino_fte.extras import missing_package
 
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""The first bytes of data that zstd compressed."""
 _BLOCK = 1 << 18
 _MOST_READ = 1 << 22  # a damaged length may ask for more than there is
 _PLACES = 20
@@ -246,7 +249,7 @@ class _Named:
         for at in range(0, len(data), _STEP):
             try:
                 parts.append(self._inner.decompress(data[at : at + _STEP]))
-            except Exception as error:
+            except Exception as error:  # each library has errors of its own
                 if not parts:
                     raise
                 self._failed = error
@@ -287,3 +290,26 @@ def decompressor(name: str) -> Any:
 
 
 Messages = Iterator[RawMessage]
+
+
+class FileWalk:
+    """What walks through one file of a bag.
+
+    Parameters
+    ----------
+    path : Path
+    losses : Losses
+        Counts what is read and lost.
+
+    Attributes
+    ----------
+    channels : dict of int to Channel
+        Those that were met so far, by their numbers in the file.
+    counts : dict of int to int
+        Messages by channel, as the file's own index says.
+    """
+
+    def __init__(self, path: Path, losses: Losses) -> None:
+        self.path, self.losses = path, losses
+        self.channels: dict[int, Channel] = {}
+        self.counts: dict[int, int] = {}
