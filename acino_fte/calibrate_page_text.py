@@ -89,7 +89,7 @@ def facts(work: Work) -> tuple[str, str, str]:
     outliers = int(np.sum(solution.outlier))
     lines = [
         f"left out {solution.left_out_rmse_px:.2f} px · median {solution.median_px:.2f} px · {used} pairs"
-        + (f", {outliers} of them outliers" if outliers else "")
+        + (f", {outliers} of them {'an outlier' if outliers == 1 else 'outliers'}" if outliers else "")
         + (f" · {n - used} dropped" if n > used else ""),
         f"{focal} · centre {matrix[0, 2]:.1f}, {matrix[1, 2]:.1f} px",
         "lidar to camera: {:.3f}, {:.3f}, {:.3f} m".format(*camera.translation)

@@ -35,6 +35,11 @@ Ending = Literal["done", "interrupted", "browser closed"]
 _AWAY = 5.0  # s without any tab before the browser counts as closed: a tab that loads anew is back sooner
 _served = threading.Lock()
 
+_LOST = """
+#popup[aria-hidden=false] { inset: 0; margin: auto; width: 32em; height: fit-content; max-width: 90vw }
+#popup::after {
+  content: "Do not go on here: if the program has ended, start it again. What you did before is saved." }
+"""  # of the message when the connection is lost, which else is easily overlooked
 _OVER = """
 window.socket?.disconnect();
 document.body.append(Object.assign(document.createElement('div'), {id: 'farewell', textContent: %s,
@@ -289,6 +294,7 @@ def _build(session: PageSession, build: Callable[[PageSession], object]) -> None
     from nicegui import ui
 
     ui.add_css(".local-page-error .q-notification__message { white-space: pre-wrap; font-family: inherit }")
+    ui.add_css(_LOST)
     try:
         build(session)
     except InputError as error:

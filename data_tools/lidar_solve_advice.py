@@ -71,9 +71,11 @@ def advice(
         length = np.linalg.norm(fit.residual, axis=1)
         order = wrong[np.argsort(-np.nan_to_num(length[wrong], nan=np.inf))]
         listed = ", ".join(f"{rows[i] + 1} ({length[i]:.0f} px)" for i in order[:8])
+        one = len(wrong) == 1
         out.append(
-            f"{len(wrong)} of {len(rows)} pairs do not fit the others and do not count: {listed}"
-            f"{', …' if len(wrong) > 8 else ''}. Look at them: often a return from beside an edge was picked."
+            f"{len(wrong)} of {len(rows)} pairs {'does' if one else 'do'} not fit the others and "
+            f"{'does' if one else 'do'} not count: {listed}{', …' if len(wrong) > 8 else ''}. Look at "
+            f"{'it' if one else 'them'}: often a return from beside an edge was picked."
         )
     if fit.scale > _COARSE:
         out.append(
