@@ -46,13 +46,15 @@ class EncoderCounts:
 
 def is_table(path: Path) -> bool:
     """Whether a file is text, or nothing that could be a recording."""
-    if not path.is_file():
-        return not path.exists()
     try:
+        if not path.is_file():
+            return not path.exists()
         with path.open("rb") as file:
             return b"\0" not in file.read(_HEAD)
     except OSError as error:
-        raise InputError("The file cannot be read.", file=path, found=str(error)) from None
+        raise InputError(
+            "The file cannot be read.", file=path, found=str(error), remedy="check that you may read it"
+        ) from None
 
 
 def inertial_samples(

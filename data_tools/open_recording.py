@@ -56,6 +56,20 @@ def recording_kind(path: Path | str) -> RecordingKind:
         It is none that can be read.
     """
     path = Path(path)
+    try:
+        return _kind(path)
+    except OSError as error:
+        raise InputError(
+            "The recording cannot be opened.",
+            file=path,
+            expected=_EXPECTED,
+            found=error.strerror or str(error),
+            remedy="check that you may read it",
+        ) from error
+
+
+def _kind(path: Path) -> RecordingKind:
+    """What a recording is; an OSError where it cannot be read."""
     if path.is_dir():
         return _folder_kind(path)
     if not path.is_file():

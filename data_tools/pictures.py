@@ -149,7 +149,10 @@ class PictureFolder:
                 expected=f"0 to {len(self.files) - 1}",
             )
         file = self.files[frame]
-        data = np.fromfile(file, np.uint8)
+        try:
+            data = np.fromfile(file, np.uint8)
+        except OSError as error:
+            raise InputError("The image cannot be read.", file=file, found=str(error)) from error
         pixels = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if len(data) else None
         if pixels is None:
             raise InputError(

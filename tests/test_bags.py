@@ -483,3 +483,16 @@ def test_real_bags(name, count):
     with BagReader(ROSBAG1 / f"{name}.bag") as reader:
         assert sum(stream.count for stream in reader.streams) == count
         assert sum(1 for _ in reader.records()) == count == reader.damage.n_read and reader.damage.whole
+
+
+def test_a_recording_that_may_not_be_read(tmp_path, monkeypatch):
+    path = tmp_path / "a.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n")
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("pathlib.Path.open", refuse)
+    with pytest.raises(InputError, match="cannot be opened") as error:
+        open_recording(path)
+    assert error.value.file == str(path)
