@@ -230,7 +230,7 @@ def check_linear_solver(status: Status, iterations: int, options: SolveOptions) 
 
 # Relative decrease per iteration below which the exact Hessian takes over. Residuals are large where the
 # skeleton does not fit the animal, and Gauss–Newton steps then only crawl to the minimum.
-_NEAR = 1e-5
+_NEAR = 3e-5
 _SLOW = 2  # iterations in a row with little gain: the first ones may be short while the barrier settles
 _PATIENCE = 8  # iterations: where the skeleton fits, Gauss–Newton is done by then
 
