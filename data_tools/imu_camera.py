@@ -178,11 +178,13 @@ def find_mounting(
     covariance = shared * variance * np.linalg.pinv(information, rcond=1e-12)
     worst = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     if worst > _UNSURE or np.linalg.eigvalsh(information[:3, :3])[0] < 1e-9:
+        left_open = (
+            f"it unsure by {np.degrees(worst):.1f}°" if worst < np.pi else "a turn about their axis open"
+        )
         raise InputError(
             "How the sensor sits on the camera cannot be found from this recording.",
             expected="turns about two axes at least (pan and tilt)",
-            found=f"turns of {np.degrees(np.abs(seen).max()):.2f}° at most, which leave it unsure by "
-            f"{np.degrees(worst):.1f}°",
+            found=f"turns of {np.degrees(np.abs(seen).max()):.2f}° at most, which leave {left_open}",
             remedy="state the mounting (--imu-to-camera), or record one pan and one tilt by hand",
         )
     notes: tuple[str, ...] = (
