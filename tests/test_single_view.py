@@ -44,7 +44,7 @@ def test_the_lidar_tells_the_depth_to_a_body(options):
 
 
 def test_the_path_among_returns_is_the_slow_one_in_front():
-    """20 returns on an animal whose size is 4 % off and drifts, 60 on a hedge behind it, a few on grass before."""
+    """20 returns on an animal whose size is 4 % off and drifts, 60 on a hedge behind it, a few before it."""
     rng = np.random.default_rng(0)
     size = np.full(50, 90.0)
     ratio = np.linspace(1.03, 1.05, 50)
