@@ -7,10 +7,7 @@ temporary file beside it, which then takes its name.
 from __future__ import annotations
 
 import json
-import os
-from contextlib import suppress
 from pathlib import Path
-from secrets import token_hex
 from typing import Literal
 
 import numpy as np
@@ -164,33 +161,6 @@ def as_text(document: Adjustments) -> str:
     )
     body = f'  "adjustments": [\n{rows}\n  ]' if rows else '  "adjustments": []'
     return "\n".join(["{", *lines, body, "}"]) + "\n"
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file whole or not at all, even when the process or the computer stops meanwhile.
-
-    Raises
-    ------
-    InputError
-        It cannot be written; what was there before is still there.
-    """
-    working = path.with_name(f".{path.name}.tmp-{token_hex(4)}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with working.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        working.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            working.unlink()
-        raise InputError(
-            "The file cannot be written; what it held before is still there.",
-            file=path,
-            found=error.strerror or str(error),
-            remedy="free some space, or choose another file with -o",
-        ) from None
 
 
 def positions_csv(document: Adjustments) -> str:

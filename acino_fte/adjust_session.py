@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from acino_fte.adjust_files import as_text, positions_csv, read_adjustments, write_whole
+from acino_fte.adjust_files import as_text, positions_csv, read_adjustments
 from acino_fte.adjust_geometry import (
     Sight,
     at_distance,
@@ -24,6 +24,7 @@ from acino_fte.adjust_geometry import (
 )
 from acino_fte.adjustments import Adjustments
 from acino_fte.cameras import Camera
+from acino_fte.data_tools.whole_text import write_text_whole
 from acino_fte.errors import InputError
 from acino_fte.evaluation_runs import Run
 from acino_fte.prediction import positions_at
@@ -268,7 +269,7 @@ class AdjustSession:
                     remedy="end the other one, move the file away, and change something here",
                 )
             text = as_text(self.document)
-            write_whole(self.path, text)
+            write_text_whole(self.path, text)
             self._written = sha256(text.encode()).hexdigest()
             self.error = None
         except InputError as error:
@@ -277,7 +278,7 @@ class AdjustSession:
     def export(self) -> Path:
         """Write the adjusted positions as CSV beside the file of adjustments."""
         path = self.path.with_suffix(".csv")
-        write_whole(path, positions_csv(self.document))
+        write_text_whole(path, positions_csv(self.document))
         return path
 
     # --- parts -------------------------------------------------------------------------------------

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from acino_fte.calibrate_page_model import Pair, Picks, as_lidar_pairs, from_lidar_pairs
-from acino_fte.data_tools.lidar_pairs import read_lidar_pairs, write_lidar_pairs, write_text_whole
+from acino_fte.data_tools.lidar_pairs import read_lidar_pairs, write_lidar_pairs
+from acino_fte.data_tools.whole_text import write_text_whole
 from acino_fte.errors import InputError
 
 FORMAT = "acino-fte/picking/1"

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from acino_fte.cameras import Camera
-from acino_fte.data_tools.lidar_pairs import write_text_whole
+from acino_fte.data_tools.whole_text import write_text_whole
 from acino_fte.errors import InputError
 
 FORMAT = "acino-fte/lidar-camera/1"

@@ -5,16 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from secrets import token_hex
 from typing import Any
 
 import numpy as np
 
+from acino_fte.data_tools.whole_text import write_text_whole
 from acino_fte.errors import InputError, did_you_mean
 
 FORMAT = "acino-fte/lidar-pairs/1"
@@ -340,20 +338,3 @@ def write_lidar_pairs(path: Path | str, pairs: LidarPairs) -> None:
         writer.writerows([[repr(v) if isinstance(v, float) else v for v in row] for row in rows])
         text = stream.getvalue()
     write_text_whole(path, text)
-
-
-def write_text_whole(path: Path, text: str) -> None:
-    """Write a text file under another name first, so that a killed process leaves the old one."""
-    working = path.with_name(f".{path.name}.tmp-{token_hex(4)}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with working.open("w", encoding="utf-8", newline="") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        working.replace(path)
-    except OSError as error:
-        raise InputError("The file cannot be written.", file=path, found=str(error)) from error
-    finally:
-        with suppress(OSError):  # of a folder that is none
-            working.unlink(missing_ok=True)

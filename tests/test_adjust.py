@@ -16,10 +16,11 @@ from evaluation_made import CORRECTION, START, STOP, edited, make_run
 from test_run_cli import ENVIRONMENT
 from typer.testing import CliRunner
 
-from acino_fte.adjust_files import as_text, positions_csv, read_adjustments, write_whole
+from acino_fte.adjust_files import as_text, positions_csv, read_adjustments
 from acino_fte.adjust_session import open_session
 from acino_fte.adjustments import Adjustments
 from acino_fte.cli_adjust import adjust
+from acino_fte.data_tools.whole_text import write_text_whole
 from acino_fte.errors import InputError
 from acino_fte.evaluation_runs import open_run
 from acino_fte.evaluation_statistics import move_rows
@@ -127,7 +128,7 @@ def test_the_file_keeps_before_and_after(run, tmp_path):
     document.change(12, run.markers[5], np.array([4.0, 1.0, 2.0]), "cam1")
     document.check(17)
     path = tmp_path / "a.json"
-    write_whole(path, as_text(document))
+    write_text_whole(path, as_text(document))
     data = json.loads(path.read_text(encoding="utf-8"))
     assert data["format"] == "acino-fte/adjustments/1" and data["run"]["sha256"] == run.identity
     first = data["adjustments"][0]
@@ -143,7 +144,7 @@ def test_the_file_keeps_before_and_after(run, tmp_path):
 def test_adjustments_of_another_run_are_refused(folder, run, tmp_path):
     other = open_run(folder / "other")
     path = tmp_path / "a.json"
-    write_whole(path, as_text(Adjustments(other)))
+    write_text_whole(path, as_text(Adjustments(other)))
     error = message(read_adjustments, path, [run])
     assert (
         "another run" in str(error) and other.identity[:12] in str(error) and run.identity[:12] in str(error)
@@ -177,7 +178,7 @@ def entry(run, **changes):
 )
 def test_files_edited_by_hand_get_one_clear_message(run, tmp_path, changes, words):
     path = tmp_path / "a.json"
-    write_whole(path, as_text(Adjustments(run)))
+    write_text_whole(path, as_text(Adjustments(run)))
     if isinstance(changes.get("adjustments"), list) and changes["adjustments"] != [{"frame": 1}]:
         changes = {"adjustments": [entry(run, **c) for c in changes["adjustments"]]}
     assert words in str(message(read_adjustments, edited(path, **changes), [run]))

@@ -11,9 +11,10 @@ from evaluation_made import make_run
 from test_run_cli import snapshot
 from typer.testing import CliRunner
 
-from acino_fte.adjust_files import as_text, write_whole
+from acino_fte.adjust_files import as_text
 from acino_fte.adjustments import Adjustments
 from acino_fte.cli_histograms import histograms
+from acino_fte.data_tools.whole_text import write_text_whole
 from acino_fte.evaluation_runs import open_run
 
 
@@ -28,7 +29,7 @@ def folder(tmp_path_factory):
     for frame, step in ((12, 0.03), (13, 0.04), (14, 0.05)):
         before = np.array(document.before(frame, "nose"))
         document.change(frame, "nose", before + [0, 0, step], "cam1")
-    write_whole(folder / "day1.json", as_text(document))
+    write_text_whole(folder / "day1.json", as_text(document))
     pixels = run.reprojected()[2:5, 0, 0] + 6.0
     rows = [f"{f},nose,{u:.6f},{v:.6f}" for f, (u, v) in zip((12, 13, 14), pixels, strict=True)]
     (folder / "labels.csv").write_text("frame,marker,u,v\n" + "\n".join(rows), encoding="utf-8")
