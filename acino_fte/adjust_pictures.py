@@ -12,6 +12,7 @@ import numpy as np
 
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.evaluation_runs import Run
+from acino_fte.extras import load_cv2
 
 _QUALITY = 88
 _ASPECT = 0.01
@@ -42,25 +43,13 @@ class Pictures:
 
 def as_jpeg(pixels: np.ndarray) -> bytes:
     """Pixels (H, W) or (H, W, 3), uint8 or uint16, as JPEG."""
-    cv2 = _cv2()
+    cv2 = load_cv2()
     if pixels.dtype == np.uint16:
         top = max(1, int(pixels.max()))
         pixels = (pixels.astype(np.uint32) * 255 // top).astype(np.uint8)
     if pixels.ndim == 3:
         pixels = np.ascontiguousarray(pixels[..., ::-1])
     return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-
-
-def _cv2():  # noqa: ANN202
-    try:
-        import cv2
-    except ImportError as error:
-        raise InputError(
-            "Pictures need a package that is not installed.",
-            found=str(error),
-            remedy='pip install "acino-fte[lidar]"',
-        ) from error
-    return cv2
 
 
 def pictures_of_run(run: Run, videos: Sequence[str], folders: Sequence[str]) -> Pictures:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from acino_fte.errors import InputError
+from acino_fte.extras import load_cv2
 
 MOST_POINTS = 2_000_000
 """Points that the page shows of a cloud; of a larger one every second, third, … point."""
@@ -142,7 +143,7 @@ def _from_file(path: Path | str) -> tuple[bytes, str, tuple[int, int]]:
         content = path.read_bytes()
     except OSError as error:
         raise InputError("The image cannot be read.", file=path, found=str(error)) from error
-    cv2 = _opencv()
+    cv2 = load_cv2()
     pixels = (
         cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)
         if content
@@ -158,18 +159,10 @@ def _from_file(path: Path | str) -> tuple[bytes, str, tuple[int, int]]:
 
 def _from_array(pixels: np.ndarray) -> tuple[bytes, str, tuple[int, int]]:
     """PNG of pixels; deep ones are stretched over the middle 99.8 % of their values."""
-    cv2 = _opencv()
+    cv2 = load_cv2()
     if pixels.dtype != np.uint8:
         low, high = np.percentile(pixels, [0.1, 99.9])
         pixels = np.clip((pixels - low) * (255.0 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
     ordered = pixels if pixels.ndim == 2 else pixels[..., 2::-1]
     _, png = cv2.imencode(".png", np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return png.tobytes(), "image/png", (pixels.shape[1], pixels.shape[0])
-
-
-def _opencv():
-    try:
-        import cv2
-    except ImportError as error:
-        raise InputError("Reading images needs OpenCV.", found=str(error), remedy=_REMEDY) from error
-    return cv2

@@ -80,10 +80,10 @@ def load_sequence(
         parameters = read_truth_parameters(file.truth_parameters, skeleton, cameras.names, n_frames)
     lidar = None
     if file.lidar is not None:
-        from acino_fte.data_tools.sequence_lidar import lens_warnings, read_lidar
+        from acino_fte.data_tools.sequence_lidar import read_lidar
 
-        lidar = read_lidar(file.lidar, cameras, source)
-        warnings += lens_warnings(file.lidar, cameras)
+        lidar, said = read_lidar(file.lidar, cameras, source)
+        warnings += said
     folder = source.parent if source.is_file() else source
     name = file.name or folder.resolve().name
     sequence = Sequence(

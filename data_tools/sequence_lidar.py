@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from acino_fte.cameras import CameraArray
+from acino_fte.cameras import Camera, CameraArray
 from acino_fte.data_tools.lidar_camera import read_lidar_camera
 from acino_fte.data_tools.sequence_file import LidarEntry
 from acino_fte.errors import InputError, did_you_mean
@@ -24,7 +24,7 @@ _DAMAGE = (  # what the readers of zip, of zlib and of NumPy's headers raise
 )
 
 
-def read_lidar(entry: LidarEntry, cameras: CameraArray, source: Path) -> Lidar:
+def read_lidar(entry: LidarEntry, cameras: CameraArray, source: Path) -> tuple[Lidar, list[str]]:
     """Read what the key ``lidar`` of a sequence file names.
 
     Parameters
@@ -35,6 +35,13 @@ def read_lidar(entry: LidarEntry, cameras: CameraArray, source: Path) -> Lidar:
         Of the sequence.
     source : Path
         The sequence file, for messages.
+
+    Returns
+    -------
+    Lidar
+        In the order of time.
+    list of str
+        What the user should know of its calibration.
 
     Raises
     ------
@@ -51,10 +58,11 @@ def read_lidar(entry: LidarEntry, cameras: CameraArray, source: Path) -> Lidar:
             found=entry.camera,
             remedy="use the name of a camera that has keypoints",
         )
-    calibration = read_lidar_camera(entry.calibration, entry.direction, camera=cameras[entry.camera]).camera
+    camera = cameras[entry.camera]
+    calibration = read_lidar_camera(entry.calibration, entry.direction, camera=camera).camera
     arrays = read_returns(Path(entry.returns))
     order = np.argsort(arrays["time"], kind="stable")
-    return Lidar(
+    lidar = Lidar(
         entry.camera,
         arrays["time"][order],
         arrays["xyz"][order],
@@ -64,6 +72,7 @@ def read_lidar(entry: LidarEntry, cameras: CameraArray, source: Path) -> Lidar:
         entry.range_sd,
         1e-3 * entry.time_sd_ms,
     )
+    return lidar, _lens_warnings(camera, calibration, Path(entry.calibration).name)
 
 
 def read_returns(path: Path) -> dict[str, np.ndarray]:
@@ -116,14 +125,12 @@ def read_returns(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def lens_warnings(entry: LidarEntry, cameras: CameraArray) -> list[str]:
+def _lens_warnings(camera: Camera, solved: Camera, file: str) -> list[str]:
     """What is to be said where the calibration was solved with another lens than the sequence's camera has.
 
     Pose and lens are solved together: a camera that is nearer with a shorter lens sees nearly the same, and
     the pose of the one is wrong for the other.
     """
-    camera = cameras[entry.camera]
-    solved = read_lidar_camera(entry.calibration, entry.direction, camera=camera).camera
     width, height = camera.resolution
     u, v = np.meshgrid(np.linspace(0.1, 0.9, 5) * width, np.linspace(0.1, 0.9, 5) * height)
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
@@ -134,6 +141,6 @@ def lens_warnings(entry: LidarEntry, cameras: CameraArray) -> list[str]:
     if worst <= _LENS_PX:
         return []
     return [
-        f"the lidar was calibrated with another lens than camera '{entry.camera}' has: up to {worst:.0f} px "
-        f"apart in the picture; use the camera of {Path(entry.calibration).name} in cameras.json"
+        f"the lidar was calibrated with another lens than camera '{camera.name}' has: up to {worst:.0f} px "
+        f"apart in the picture; use the camera of {file} in cameras.json"
     ]

@@ -73,7 +73,7 @@ def test_the_start_faces_the_right_way(angle):
     assert np.median(np.abs(np.degrees(np.angle(np.exp(1j * gap))))) < 15.0
 
 
-def test_without_a_lidar_the_size_is_the_species(capsys):
+def test_without_a_lidar_the_size_is_the_species():
     """It still works, and says what its scale rests on; the image is fitted as well as with one."""
     sequence, kinematics, simulation = recording(lidar="none", distance=40.0, occlusion=False)
     result = estimate_fte(sequence, kinematics, EstimateOptions(covariance=False))
