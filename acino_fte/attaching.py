@@ -25,12 +25,11 @@ _CHUNK = 50_000  # returns at once: every one is compared to every link
 class Attached:
     """Returns attached to links. K of them.
 
-    ``row`` (K,) is the return's place in the lidar's arrays, ``frame`` (K,) the nearest frame's index,
-    ``start``, ``end`` (K,) the markers of its link, ``along`` (K,) is u, ``side`` and ``front`` (K,) are g
-    and f, m; ``bulge`` (K,) is c; ``depth`` (K,) is z in the camera's frame at the time of the frame, m.
+    ``frame`` (K,) is the nearest frame's index, ``start``, ``end`` (K,) are the markers of its link, ``along``
+    (K,) is u, ``side`` and ``front`` (K,) are g and f, m; ``bulge`` (K,) is c; ``depth`` (K,) is z in the
+    camera's frame at the time of the frame, m.
     """
 
-    row: np.ndarray
     frame: np.ndarray
     start: np.ndarray
     end: np.ndarray
@@ -83,7 +82,7 @@ def attach(
     row, frame, before, share = _in_time(lidar, frames, fps)
     xyz = lidar.to_camera()[row]
     near = _near_body(xyz, local, before, front_sd)
-    given = _Near(row, frame, before, share, xyz)
+    given = _Near(frame, before, share, xyz)
     width, target = min(front_sd, _WIDEST), local if target is None else target
     chunks = np.array_split(near, max(1, -(-len(near) // _CHUNK)))
     parts = [_attach_some(given.at(rows), local, target, skeleton, surface, width) for rows in chunks]
@@ -92,9 +91,8 @@ def attach(
 
 @dataclass(frozen=True, eq=False)
 class _Near:
-    """Returns to be attached: row, nearest frame, frame before, share of the way on, place (K, 3)."""
+    """Returns to be attached: nearest frame, frame before, share of the way on, place (K, 3)."""
 
-    row: np.ndarray
     frame: np.ndarray
     before: np.ndarray
     share: np.ndarray
@@ -129,9 +127,7 @@ def _attach_some(
     moved = on_link(target[frame[every]], start, end, u) - on_link(then[every], start, end, u)
     chosen = (every, best)
     depth = (xyz[every] + moved)[:, 2]
-    return Attached(
-        near.row[every], frame[every], start, end, u, side[chosen], front[chosen], bulge[chosen], depth
-    )
+    return Attached(frame[every], start, end, u, side[chosen], front[chosen], bulge[chosen], depth)
 
 
 def _in_time(lidar: Lidar, frames: np.ndarray, fps: float) -> tuple[np.ndarray, ...]:
