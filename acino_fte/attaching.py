@@ -25,9 +25,9 @@ _CHUNK = 50_000  # returns at once: every one is compared to every link
 class Attached:
     """Returns attached to links. K of them.
 
-    ``frame`` (K,) is the nearest frame's index, ``start``, ``end`` (K,) are the markers of its link, ``along``
-    (K,) is u, ``side`` and ``front`` (K,) are g and f, m; ``bulge`` (K,) is c; ``depth`` (K,) is z in the
-    camera's frame at the time of the frame, m.
+    ``frame`` (K,) is the nearest frame's index, ``start``, ``end`` (K,) are the markers of its link,
+    ``along`` (K,) is u, ``side`` and ``front`` (K,) are g and f, m; ``bulge`` (K,) is c; ``depth``
+    (K,) is z in the camera's frame at the time of the frame, m.
     """
 
     frame: np.ndarray
