@@ -21,26 +21,28 @@ class _Part(BaseModel):
 class Lens(_Part):
     """A lens, fixed or zoom."""
 
-    focal_mm: tuple[float, float] = Field((5.0, 150.0), description="shortest and longest focal length")
-    used_mm: float = Field(150.0, gt=0, description="focal length of the recording")
-    f_number: float = Field(4.0, gt=0, description="aperture of the recording")
-    focus_m: float = Field(90.0, gt=0, description="distance that is in focus")
+    focal_mm: tuple[float, float] = Field(
+        default=(5.0, 150.0), description="shortest and longest focal length"
+    )
+    used_mm: float = Field(default=150.0, gt=0, description="focal length of the recording")
+    f_number: float = Field(default=4.0, gt=0, description="aperture of the recording")
+    focus_m: float = Field(default=90.0, gt=0, description="distance that is in focus")
 
 
 class CameraPart(_Part):
     """A camera with its lens and its video."""
 
-    device: str = Field("simulated", description="driver: simulated, or the name of a real one")
-    width: int = Field(2048, gt=0, description="px")
-    height: int = Field(1088, gt=0, description="px")
-    pixel_um: float = Field(5.5, gt=0)
-    fps: float = Field(60.0, gt=0)
-    bits: int = Field(8, gt=0, description="of a raw pixel")
-    exposure_us: float = Field(1000.0, gt=0)
-    frame_overhead_us: float = Field(37.6, ge=0, description="frame time = this + line_us × lines")
-    line_us: float = Field(5.375, ge=0)
+    device: str = Field(default="simulated", description="driver: simulated, or the name of a real one")
+    width: int = Field(default=2048, gt=0, description="px")
+    height: int = Field(default=1088, gt=0, description="px")
+    pixel_um: float = Field(default=5.5, gt=0)
+    fps: float = Field(default=60.0, gt=0)
+    bits: int = Field(default=8, gt=0, description="of a raw pixel")
+    exposure_us: float = Field(default=1000.0, gt=0)
+    frame_overhead_us: float = Field(default=37.6, ge=0, description="frame time = this + line_us × lines")
+    line_us: float = Field(default=5.375, ge=0)
     codec: Literal["h264", "raw"] = "h264"
-    bitrate_mbit: float = Field(20.0, gt=0, description="of the video, Mbit/s")
+    bitrate_mbit: float = Field(default=20.0, gt=0, description="of the video, Mbit/s")
     lens: Lens = Lens()
 
 
@@ -48,19 +50,21 @@ class LidarPart(_Part):
     """A lidar with the inertial sensor in it."""
 
     device: str = "simulated"
-    rate_hz: float = Field(10.0, gt=0, description="frames a second")
-    points: int = Field(24_000, gt=0, description="points in a frame")
+    rate_hz: float = Field(default=10.0, gt=0, description="frames a second")
+    points: int = Field(default=24_000, gt=0, description="points in a frame")
     returns: Literal["single", "dual"] = "single"
-    fov_deg: tuple[float, float] = Field((14.5, 16.2), description="horizontal, vertical")
-    mb_s: float = Field(3.4, gt=0, description="MB/s in LVX, single returns; twice that with dual")
-    imu_hz: float = Field(200.0, ge=0, description="0 for none")
+    fov_deg: tuple[float, float] = Field(default=(14.5, 16.2), description="horizontal, vertical")
+    mb_s: float = Field(default=3.4, gt=0, description="MB/s in LVX, single returns; twice that with dual")
+    imu_hz: float = Field(default=200.0, ge=0, description="0 for none")
 
 
 class EncoderPart(_Part):
     """An incremental encoder on a ring of the lens or an axis of the head."""
 
     counts_per_turn: float = Field(gt=0, description="counts of the decoder (×4) in a turn of the shaft")
-    tolerance: float = Field(20.0, ge=0, description="counts within which the calibration stays valid")
+    tolerance: float = Field(
+        default=20.0, ge=0, description="counts within which the calibration stays valid"
+    )
 
 
 def _encoders() -> dict[str, EncoderPart]:
@@ -75,26 +79,28 @@ def _encoders() -> dict[str, EncoderPart]:
 class Storage(_Part):
     """Disk and memory of the computer."""
 
-    capacity_gb: float = Field(1000.0, gt=0)
-    write_mb_s: float = Field(1000.0, gt=0, description="that the disk can take for long")
-    ram_gb: float = Field(32.0, gt=0)
-    reserve_gb: float = Field(5.0, ge=0, description="that a recording leaves free")
-    segment_s: float = Field(60.0, gt=0, description="length of a file of a recording, s")
+    capacity_gb: float = Field(default=1000.0, gt=0)
+    write_mb_s: float = Field(default=1000.0, gt=0, description="that the disk can take for long")
+    ram_gb: float = Field(default=32.0, gt=0)
+    reserve_gb: float = Field(default=5.0, ge=0, description="that a recording leaves free")
+    segment_s: float = Field(default=60.0, gt=0, description="length of a file of a recording, s")
 
 
 class Wishes(_Part):
     """What is to be reached; the defaults are the requirements of the WildPose thesis."""
 
-    animal_m: float = Field(1.5, gt=0, description="length of the animal")
-    animal_height_m: float = Field(0.8, gt=0, description="height of the animal")
-    distance_m: float = Field(100.0, gt=0)
-    least_px: float = Field(50.0, gt=0, description="on the animal at that distance")
-    speed_m_s: float = Field(20.0, ge=0, description="of the animal across the picture")
-    blur_px: float = Field(2.0, gt=0, description="largest motion blur")
-    hours: float = Field(10.0, gt=0, description="of footage on the disk")
-    minutes: float = Field(10.0, gt=0, description="of one recording without loss")
-    pan_cm: float = Field(20.0, gt=0, description="largest step of pan and tilt, at that distance")
-    lidar_points: float = Field(20.0, gt=0, description="least returns on the animal in a lidar frame")
+    animal_m: float = Field(default=1.5, gt=0, description="length of the animal")
+    animal_height_m: float = Field(default=0.8, gt=0, description="height of the animal")
+    distance_m: float = Field(default=100.0, gt=0)
+    least_px: float = Field(default=50.0, gt=0, description="on the animal at that distance")
+    speed_m_s: float = Field(default=20.0, ge=0, description="of the animal across the picture")
+    blur_px: float = Field(default=2.0, gt=0, description="largest motion blur")
+    hours: float = Field(default=10.0, gt=0, description="of footage on the disk")
+    minutes: float = Field(default=10.0, gt=0, description="of one recording without loss")
+    pan_cm: float = Field(default=20.0, gt=0, description="largest step of pan and tilt, at that distance")
+    lidar_points: float = Field(
+        default=20.0, gt=0, description="least returns on the animal in a lidar frame"
+    )
 
 
 class RigFile(_Part):
