@@ -106,7 +106,7 @@ class Wishes(_Part):
 class RigFile(_Part):
     """The content of a ``rig.yaml``."""
 
-    format: Literal["acino-fte/rig/1"] = FORMAT
+    format: Literal["acino-fte/rig/1"] = "acino-fte/rig/1"
     name: str = "rig"
     cameras: dict[str, CameraPart] = Field(default_factory=lambda: {"cam1": CameraPart()})
     lidars: dict[str, LidarPart] = Field(default_factory=lambda: {"lidar1": LidarPart()})
