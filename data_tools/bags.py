@@ -206,7 +206,7 @@ class BagReader:
             n, why = self._undecoded.get(channel.topic, (0, str(error)))
             self._undecoded[channel.topic] = (n + 1, why)
             return None
-        return Record(channel.topic, kind, message.received_ns, value)
+        return Record(channel.topic, kind, message.received_ns, value, published_ns=message.published_ns)
 
     def fields(self, record: Record) -> dict[str, Any]:
         """Fields of a record of kind ``"other"``, decoded by the definition that the bag (or ROS) has of it.

@@ -116,13 +116,13 @@ class McapWalk(FileWalk):
                 self._define(op, content)
 
     def _message(self, content: bytes, place: str) -> Messages:
-        number, _, received = struct.unpack_from("<HIQ", content)
+        number, _, received, published = struct.unpack_from("<HIQQ", content)
         channel = self.channels.get(number)
         if channel is None:
             self.losses.note(f"the message at {place} is of the unknown channel {number}", 1, len(content))
             return
         self.losses.read += 1
-        yield RawMessage(channel, received, content[22:])
+        yield RawMessage(channel, received, content[22:], published)
 
     def _define(self, op: int, content: bytes) -> None:
         """Take what a record says of others."""

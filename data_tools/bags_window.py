@@ -51,6 +51,7 @@ class RawMessage:
     channel: Channel
     received_ns: int
     data: bytes
+    published_ns: int | None = None
 
 
 class Losses:

@@ -116,13 +116,17 @@ class PictureInfo:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One record of a stream. `value` is None where the kind is ``"other"``: `raw` has its bytes then."""
+    """One record of a stream. `value` is None where the kind is ``"other"``: `raw` has its bytes then.
+
+    `published_ns` is a second stamp of the computer, where the file has one: the publish time of MCAP.
+    """
 
     stream: str
     kind: Kind
     received_ns: int | None
     value: LidarReturns | ImuSamples | Picture | PictureInfo | None
     raw: bytes | None = None
+    published_ns: int | None = None
 
 
 @dataclass(frozen=True)
