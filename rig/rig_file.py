@@ -35,13 +35,13 @@ class CameraPart(_Part):
     device: str = Field(default="simulated", description="driver: simulated, or the name of a real one")
     width: int = Field(default=2048, gt=0, description="px")
     height: int = Field(default=1088, gt=0, description="px")
-    pixel_um: float = Field(default=5.5, gt=0)
-    fps: float = Field(default=60.0, gt=0)
+    pixel_um: float = Field(default=5.5, gt=0, description="from pixel to pixel, µm")
+    fps: float = Field(default=60.0, gt=0, description="images a second")
     bits: int = Field(default=8, gt=0, description="of a raw pixel")
-    exposure_us: float = Field(default=1000.0, gt=0)
+    exposure_us: float = Field(default=1000.0, gt=0, description="µs")
     frame_overhead_us: float = Field(default=37.6, ge=0, description="frame time = this + line_us × lines")
-    line_us: float = Field(default=5.375, ge=0)
-    codec: Literal["h264", "raw"] = "h264"
+    line_us: float = Field(default=5.375, ge=0, description="µs")
+    codec: Literal["h264", "raw"] = Field(default="h264", description="h264 or raw")
     bitrate_mbit: float = Field(default=20.0, gt=0, description="of the video, Mbit/s")
     lens: Lens = Lens()
 
@@ -49,10 +49,10 @@ class CameraPart(_Part):
 class LidarPart(_Part):
     """A lidar with the inertial sensor in it."""
 
-    device: str = "simulated"
+    device: str = Field(default="simulated", description="driver: simulated, or the name of a real one")
     rate_hz: float = Field(default=10.0, gt=0, description="frames a second")
     points: int = Field(default=24_000, gt=0, description="points in a frame")
-    returns: Literal["single", "dual"] = "single"
+    returns: Literal["single", "dual"] = Field(default="single", description="single or dual")
     fov_deg: tuple[float, float] = Field(default=(14.5, 16.2), description="horizontal, vertical")
     mb_s: float = Field(default=3.4, gt=0, description="MB/s in LVX, single returns; twice that with dual")
     imu_hz: float = Field(default=200.0, ge=0, description="0 for none")
@@ -79,10 +79,13 @@ def _encoders() -> dict[str, EncoderPart]:
 class Storage(_Part):
     """Disk and memory of the computer."""
 
-    capacity_gb: float = Field(default=1000.0, gt=0)
-    write_mb_s: float = Field(default=1000.0, gt=0, description="that the disk can take for long")
-    ram_gb: float = Field(default=32.0, gt=0)
-    reserve_gb: float = Field(default=5.0, ge=0, description="that a recording leaves free")
+    capacity_gb: float = Field(default=1000.0, gt=0, description="GB of 10⁹ bytes")
+    write_mb_s: float = Field(default=1000.0, gt=0, description="MB/s that the disk can take for long")
+    ram_gb: float = Field(default=32.0, gt=0, description="memory, GB")
+    buffer_share: float = Field(
+        default=0.5, gt=0, le=1, description="of the memory that may hold what waits for the disk"
+    )
+    reserve_gb: float = Field(default=5.0, ge=0, description="GB that a recording leaves free")
     segment_s: float = Field(default=60.0, gt=0, description="length of a file of a recording, s")
 
 
@@ -91,12 +94,19 @@ class Wishes(_Part):
 
     animal_m: float = Field(default=1.5, gt=0, description="length of the animal")
     animal_height_m: float = Field(default=0.8, gt=0, description="height of the animal")
-    distance_m: float = Field(default=100.0, gt=0)
+    animal_fill: float = Field(
+        default=0.5, gt=0, le=1, description="share of length × height that its body covers"
+    )
+    distance_m: float = Field(default=100.0, gt=0, description="of the animal")
     least_px: float = Field(default=50.0, gt=0, description="on the animal at that distance")
     speed_m_s: float = Field(default=20.0, ge=0, description="of the animal across the picture")
     blur_px: float = Field(default=2.0, gt=0, description="largest motion blur")
+    sharp_px: float = Field(
+        default=2.0, gt=0, description="largest blur of what is out of focus (circle of confusion)"
+    )
     hours: float = Field(default=10.0, gt=0, description="of footage on the disk")
     minutes: float = Field(default=10.0, gt=0, description="of one recording without loss")
+    vibration_h: float = Field(default=12.0, gt=0, description="hours on rough roads that the rig stands")
     pan_cm: float = Field(default=20.0, gt=0, description="largest step of pan and tilt, at that distance")
     lidar_points: float = Field(
         default=20.0, gt=0, description="least returns on the animal in a lidar frame"
