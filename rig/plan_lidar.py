@@ -86,9 +86,7 @@ def points_per_steradian(points: float, fov_deg: tuple[float, float]) -> float:
     return points / (math.pi / 4.0 * horizontal * vertical)
 
 
-def points_on_target(
-    area_m2: float, distance_m: float, points: float, fov_deg: tuple[float, float]
-) -> float:
+def points_on_target(area_m2: float, distance_m: float, points: float, fov_deg: tuple[float, float]) -> float:
     """Points of a frame that meet a surface that faces the lidar: its solid angle A / d² × the density.
 
     An upper bound: a dark coat or rain send fewer back.

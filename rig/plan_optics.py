@@ -45,9 +45,7 @@ def hyperfocal_m(focal_mm: float, f_number: float, blur_um: float) -> float:
     return 1e-3 * (focal_mm**2 / (f_number * blur_um * 1e-3) + focal_mm)
 
 
-def depth_of_field_m(
-    focus_m: float, focal_mm: float, f_number: float, blur_um: float
-) -> tuple[float, float]:
+def depth_of_field_m(focus_m: float, focal_mm: float, f_number: float, blur_um: float) -> tuple[float, float]:
     """Nearest and farthest distance (m) that is sharp; the farthest may be infinite.
 
     s (H − f) / (H + s − 2 f) and s (H − f) / (H − s) with the hyperfocal distance H, the focus s and the

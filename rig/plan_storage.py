@@ -14,7 +14,7 @@ from acino_fte.rig.rig_file import CameraPart, LidarPart, RigFile, Storage
 Codec = Literal["h264", "raw"]
 Returns = Literal["none", "single", "dual"]
 LVX_BYTES = {"single": 1363 / 96, "dual": 1363 / 48}
-"""Bytes of a point in LVX: packages of 1363 bytes with 96 points, or 48 with two returns each (types 2, 4)."""
+"""Bytes of a point in LVX: packages of 1363 bytes with 96 points, or 48 with two returns (types 2, 4)."""
 
 
 @dataclass(frozen=True)
