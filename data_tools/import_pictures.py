@@ -11,6 +11,7 @@ import numpy as np
 
 from acino_fte.data_tools.open_recording import open_recording
 from acino_fte.data_tools.recording import Picture
+from acino_fte.data_tools.rig_reader import RigReader
 
 
 class VideoPictures:
@@ -39,14 +40,29 @@ class VideoPictures:
 
 
 class MessagePictures:
-    """Pictures of a stream of a recording, by their order in it."""
+    """Pictures of a stream of a recording, by their order in it.
 
-    def __init__(self, recording: Path, stream: str, count: int) -> None:
+    Parameters
+    ----------
+    recording : Path
+    stream : str
+    count : int
+        How many there are.
+    n_messages : int, optional
+        Of the camera's driver. Where there are more, the pictures' own stamps tell which are without one.
+    """
+
+    def __init__(self, recording: Path, stream: str, count: int, n_messages: int | None = None) -> None:
         self.path: Path | None = None
         self.stamps_ns: np.ndarray | None = None
         self.fps: float | None = None
         self.size: tuple[int, int] | None = None
         self._recording, self._stream, self._count = recording, stream, count
+        with open_recording(recording) as reader:
+            if isinstance(reader, RigReader):
+                self.path = reader.single_video(stream)
+                if n_messages is not None and n_messages != count:
+                    self.stamps_ns = reader.picture_stamps(stream)
 
     def __len__(self) -> int:
         return self._count
@@ -55,6 +71,9 @@ class MessagePictures:
         """Pixels of frames start ≤ n < stop."""
         n = 0
         with open_recording(self._recording) as reader:
+            if isinstance(reader, RigReader):
+                yield from (picture.pixels for picture in reader.pictures(self._stream, start, stop))
+                return
             for record in reader.records(kinds=["image"], streams=[self._stream]):
                 if n >= stop:
                     return

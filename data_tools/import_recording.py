@@ -216,7 +216,8 @@ def _inputs(scan: Scan, video: VideoPictures | None, keypoints: Any, options: Im
     pictures: Pictures | None = video
     shown = image if image is not None else unread
     if pictures is None and shown is not None:
-        pictures = MessagePictures(scan.path, shown.name, len(shown) or shown.n_values)
+        n_messages = len(info) if info is not None else None
+        pictures = MessagePictures(scan.path, shown.name, len(shown) or shown.n_values, n_messages)
     n_frames = (
         len(pictures)
         if pictures is not None

@@ -7,23 +7,27 @@ from typing import Literal
 
 from acino_fte.data_tools.bags import BagReader, bag_kind
 from acino_fte.data_tools.recording import RecordingReader
+from acino_fte.data_tools.rig_reader import is_rig_folder
 from acino_fte.errors import InputError, did_you_mean
 
-_EXPECTED = "LVX or LVX2, a ROS 1 bag, a ROS 2 bag (folder, .db3, .mcap), eCAL's .hdf5 or a video"
+_EXPECTED = (
+    "LVX or LVX2, a ROS 1 bag, a ROS 2 bag (folder, .db3, .mcap), eCAL's .hdf5, a video or the folder of the "
+    "rig's recorder"
+)
 _SUFFIXES = (".lvx", ".lvx2", ".bag", ".db3", ".mcap", ".mp4", ".mkv", ".avi", ".mov")
 _LVX = b"livox_tech"
 _LVX_NUMBER = bytes.fromhex("67a70eac")
 _SEARCH = 4 << 20  # bytes in which frames without a head have to begin
-RecordingKind = Literal["lvx", "bag", "video"]
+RecordingKind = Literal["lvx", "bag", "video", "rig"]
 
 
 def open_recording(path: Path | str) -> RecordingReader:
-    """Open a recording: LVX 1.0, 1.1 and LVX2, bags of ROS 1 and ROS 2, videos.
+    """Open a recording: LVX 1.0, 1.1 and LVX2, bags of ROS 1 and ROS 2, videos, the recorder's folders.
 
     Parameters
     ----------
     path : Path
-        A file, or the folder of a ROS 2 bag. Its content tells what it is, not its name.
+        A file, or the folder of a ROS 2 bag or of the recorder. Its content tells what it is, not its name.
 
     Returns
     -------
@@ -42,6 +46,10 @@ def open_recording(path: Path | str) -> RecordingReader:
         return LvxReader(path)
     if kind == "bag":
         return BagReader(path)
+    if kind == "rig":
+        from acino_fte.data_tools.rig_reader import RigReader
+
+        return RigReader(path)
     from acino_fte.data_tools.video import VideoReader
 
     return VideoReader(path)
@@ -105,6 +113,8 @@ def _kind(path: Path) -> RecordingKind:
 
 def _folder_kind(path: Path) -> RecordingKind:
     names = sorted(f.name for f in path.iterdir())
+    if is_rig_folder(path):
+        return "rig"
     if "metadata.yaml" in names or any(
         n.endswith((".db3", ".mcap", ".db3.zstd", ".mcap.zstd")) for n in names
     ):
@@ -113,7 +123,7 @@ def _folder_kind(path: Path) -> RecordingKind:
     raise InputError(
         "The folder is no recording." if names else "The folder is empty.",
         file=path,
-        expected="the folder of a ROS 2 bag, or a file",
+        expected="the folder of a ROS 2 bag or of the rig's recorder, or a file",
         found=", ".join(names[:5]) + (", …" if len(names) > 5 else "") if names else "an empty folder",
         remedy=f"name the recording itself: {inside[0]}" if inside else None,
     )
