@@ -72,7 +72,7 @@ class MessagePictures:
         n = 0
         with open_recording(self._recording) as reader:
             if isinstance(reader, RigReader):
-                yield from (picture.pixels for picture in reader.pictures(self._stream, start, stop))
+                yield from (picture.pixels for picture in reader.pictures(self._stream, range(start, stop)))
                 return
             for record in reader.records(kinds=["image"], streams=[self._stream]):
                 if n >= stop:

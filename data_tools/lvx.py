@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from acino_fte.data_tools.lvx_head import LvxHead, is_lvx, open_binary, read_head
-from acino_fte.data_tools.lvx_losses import ErrorLog, StampLog
+from acino_fte.data_tools.lvx_losses import ErrorLog, LidarWarning, StampLog
 from acino_fte.data_tools.lvx_packets import (
     FARTHEST_M,
     IMU_NS,
@@ -101,6 +101,16 @@ class LvxReader:
         return self._reading.damage(self._head.cut)
 
     @property
+    def stamp_logs(self) -> dict[str, StampLog]:
+        """Of every stream so far, which packages are missing; complete once all records were read."""
+        return dict(self._reading.logs)
+
+    @property
+    def warnings(self) -> tuple[LidarWarning, ...]:
+        """What the lidars' error codes say; complete once all records were read."""
+        return self._reading.errors.warnings
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What is odd but cost nothing."""
         return (*self._notes, *self._reading.notes())
@@ -164,8 +174,8 @@ class _Reading:
         self._layout, self._test = head.layout, test
         self._numbers = dict(head.numbers)
         self._types: dict[tuple[int, int], np.dtype] = {}
-        self._logs: dict[str, StampLog] = {}
-        self._errors = ErrorLog()
+        self.logs: dict[str, StampLog] = {}
+        self.errors = ErrorLog()
         self._clocks: dict[str, set[str]] = {}
         self._last_pps: dict[int, int] = {}
         self._held: dict[tuple[int, bool, int], list[tuple[int, bytes]]] = {}
@@ -203,7 +213,7 @@ class _Reading:
             name = f"{'imu' if imu else 'lidar'}{index}"
             self._clocks.setdefault(name, set()).add(clock)
             tables, stamps, keep = self._tables(index, name, imu, packages, clock)
-            if self._logs[name].held:
+            if self.logs[name].held:
                 self._held[number, imu, code] = packages[-1:]
             value = self._imu(tables, stamps, keep, clock) if imu else None
             if not imu:
@@ -231,17 +241,17 @@ class _Reading:
             samples[places] = table["samples"].shape[1]
             tables.append((kind, places, table))
             if "error" in (table["header"].dtype.names or ()):
-                self._errors.add(index, table["header"]["error"])
+                self.errors.add(index, table["header"]["error"], stamps[places])
         if clock == "pps":
             stamps = self._counted_on(index, stamps)
         return tables, stamps, self._log(index, name, imu).add(stamps, samples, self._final)
 
     def _log(self, index: int, name: str, imu: bool) -> StampLog:
-        if name not in self._logs:
+        if name not in self.logs:
             kind = self.devices[index].type
             step = IMU_NS if imu else SAMPLE_NS.get(-1 if kind is None else kind)
-            self._logs[name] = StampLog(name, step)
-        return self._logs[name]
+            self.logs[name] = StampLog(name, step)
+        return self.logs[name]
 
     def _counted_on(self, index: int, stamps: np.ndarray) -> np.ndarray:
         """Stamps since the last pulse, as stamps since the first one: the nearest second to those before."""
@@ -273,7 +283,7 @@ class _Reading:
         keep: np.ndarray,
         clock: Clock,
     ) -> LidarReturns:
-        step = round(self._logs[name].step_ns())
+        step = round(self.logs[name].step_ns())
         lines = LINES.get(self.devices[index].type or 0, 1)
         parts = []
         for kind, places, table in tables:
@@ -304,7 +314,7 @@ class _Reading:
 
     def notes(self) -> list[str]:
         """What was odd on the way."""
-        out = self._errors.sentences()
+        out = self.errors.sentences()
         if self.walk is not None and self.walk.n_wrong_offsets:
             out.append(
                 f"{self.walk.n_wrong_offsets} frames have wrong offsets; they were found all the same."
@@ -319,7 +329,7 @@ class _Reading:
     def damage(self, cut_head: bool) -> Damage:
         """The account so far."""
         holes = self.walk.holes if self.walk is not None else []
-        logs = list(self._logs.values())
+        logs = list(self.logs.values())
         places = ["The file ends within its head."] if cut_head else []
         places += [_sentence(hole) for hole in holes[:_SHOWN]]
         if len(holes) > _SHOWN:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 _PAUSE_NS = 60_000_000_000
+_MOST_GAPS = 5_000
 _OUTLIER_NS = 1_000_000_000
 _ERRORS: tuple[tuple[int, int, dict[int, str]], ...] = (
     (0, 3, {1: "the temperature is high or low", 2: "the temperature is extreme", 3: "temperature fault"}),
@@ -39,6 +40,10 @@ class StampLog:
         Whether the last package taken waits for the next ones.
     n_lost : int
         Packages missing between others.
+    gaps : list of (first_ns, length_ns, count)
+        The first of them: when the missing packages would have begun, for how long, and how many.
+    jumped_ns : list of int
+        Stamps after jumps of the clock; `jumps` are their sizes, s.
     """
 
     name: str
@@ -48,6 +53,8 @@ class StampLog:
     n_gaps: int = 0
     n_outliers: int = 0
     jumps: list[float] = field(default_factory=list)
+    jumped_ns: list[int] = field(default_factory=list)
+    gaps: list[tuple[int, int, int]] = field(default_factory=list)
     worst: tuple[int, float] = (0, 0.0)
     first_ns: int | None = None
     _estimate: float | None = None
@@ -105,9 +112,13 @@ class StampLog:
         nominal = samples[:-1] * self.step_ns()
         jump = (gaps < 0) | (gaps > _PAUSE_NS)
         self.jumps += (gaps[jump] / 1e9).tolist()
+        self.jumped_ns += stamps[1:][jump].tolist()
         missing = np.where(jump, 0, np.maximum(np.rint(gaps / nominal) - 1, 0)).astype(np.int64)
         self.n_lost += int(missing.sum())
         self.n_gaps += int((missing > 0).sum())
+        begun, length = stamps[:-1] + np.rint(nominal), gaps - np.rint(nominal)
+        for i in np.flatnonzero(missing)[: _MOST_GAPS - len(self.gaps)].tolist():
+            self.gaps.append((int(begun[i]), int(length[i]), int(missing[i])))
         most = int(missing.argmax())
         if missing[most] > self.worst[0]:
             since = int(stamps[most]) - (self.first_ns or 0)
@@ -142,25 +153,41 @@ def _no_outliers(stamps: np.ndarray) -> np.ndarray:
     return keep
 
 
+@dataclass
+class LidarWarning:
+    """What a lidar warned of: text, level (1 warning, 2 and 3 errors), in how many packages, and when, ns."""
+
+    device: int
+    text: str
+    level: int
+    count: int
+    first_ns: int
+    last_ns: int
+
+
 class ErrorLog:
     """Warnings of the lidars' error codes, counted in packages."""
 
     def __init__(self) -> None:
-        self._counts: dict[tuple[int, str], int] = {}
+        self._found: dict[tuple[int, str], LidarWarning] = {}
 
-    def add(self, device: int, codes: np.ndarray) -> None:
-        """Take the codes (P,) of packages of a device."""
+    @property
+    def warnings(self) -> tuple[LidarWarning, ...]:
+        """All of them, in the order in which they came."""
+        return tuple(self._found.values())
+
+    def add(self, device: int, codes: np.ndarray, stamps: np.ndarray) -> None:
+        """Take the codes (P,) of packages of a device, and their stamps (P,) int64."""
         if not np.bitwise_or.reduce(codes):
             return
         for shift, mask, texts in _ERRORS:
-            values, counts = np.unique((codes >> np.uint32(shift)) & np.uint32(mask), return_counts=True)
-            for value, count in zip(values.tolist(), counts.tolist(), strict=True):
-                if value:
-                    key = device, texts[value]
-                    self._counts[key] = self._counts.get(key, 0) + count
+            values = (codes >> np.uint32(shift)) & np.uint32(mask)
+            for value in np.unique(values[values > 0]).tolist():
+                mine, key = stamps[values == value], (device, texts[value])
+                first, last = int(mine[0]), int(mine[-1])
+                found = self._found.setdefault(key, LidarWarning(*key, value, 0, first, last))
+                found.count, found.last_ns = found.count + len(mine), last
 
     def sentences(self) -> list[str]:
         """What the lidars warn of, one sentence each."""
-        return [
-            f"lidar{device}: {text}, in {count} packages." for (device, text), count in self._counts.items()
-        ]
+        return [f"lidar{found.device}: {found.text}, in {found.count} packages." for found in self.warnings]

@@ -7,7 +7,7 @@ folder without its manifest, with a cut segment or without a video is read as fa
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -289,8 +289,19 @@ class RigReader:
         )
         return files[0] if whole else None
 
-    def pictures(self, stream: str, start: int, stop: int) -> Iterator[Picture]:
-        """Pictures start ≤ n < stop of a camera, without decoding those before.
+    def without_picture(self, stream: str) -> tuple[np.ndarray, int]:
+        """Rows, among a camera's messages, that have no picture; and how many pictures have no message."""
+        camera, first, rows, over = _camera(stream), 0, list[np.ndarray](), 0
+        for segment in self._segments:
+            frames = self._frames_of(segment, camera)
+            rows.append(first + np.flatnonzero(frames < 0))
+            first += len(frames)
+            if camera in segment.videos:
+                over += len(self._stamps(segment.videos[camera])) - int((frames >= 0).sum())
+        return np.concatenate(rows) if rows else np.zeros(0, np.int64), over
+
+    def pictures(self, stream: str, which: Sequence[int]) -> Iterator[Picture]:
+        """Some pictures of a camera, by their rising numbers from 0, without decoding all before.
 
         One that does not decode shows the one before it once more.
         """
@@ -300,12 +311,12 @@ class RigReader:
         for segment in self._segments:
             frames = self._frames_of(segment, camera)
             frames = frames[frames >= 0]
-            wanted = frames[max(start - first, 0) : max(stop - first, 0)]
+            wanted = [int(frames[n - first]) for n in which if first <= n < first + len(frames)]
             first += len(frames)
-            if not len(wanted):
+            if not wanted:
                 continue
             with VideoReader(segment.videos[camera]) as video:
-                for n in wanted.tolist():
+                for n in wanted:
                     with suppress(InputError):
                         last = video.at(n)
                     if last is not None:

@@ -93,7 +93,7 @@ def test_pictures_that_are_missing_are_found_by_time(tmp_path):
 
 def test_any_part_of_the_pictures_across_segments(whole):
     with RigReader(whole) as reader:
-        assert [shown(p) for p in reader.pictures(IMAGE, 55, 65)] == [n % 16 for n in range(55, 65)]
+        assert [shown(p) for p in reader.pictures(IMAGE, range(55, 65))] == [n % 16 for n in range(55, 65)]
         assert reader.single_video(IMAGE) is None
 
 
