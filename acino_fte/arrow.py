@@ -4,14 +4,14 @@ The Hessian of a trajectory (N frames, Q degrees of freedom) and of P parameters
 
     H = [[A, B], [Bᵀ, D]],   A(n, m) = 0 for |n − m| > L.
 
-Frames are grouped into super-blocks, L at a time, and A becomes block tridiagonal. Its Cholesky factor
-follows from one sweep (Golub and Van Loan 2013, §4.5.1),
+LAPACK's banded Cholesky factorisation takes A apart. Frames are then grouped into super-blocks, L at a time,
+and A is block tridiagonal. With the factor's own super-blocks (Golub and Van Loan 2013, §4.5.1),
 
     L_i L_iᵀ = D_i = A_ii − W_i W_iᵀ,   W_i = A_(i,i−1) L_(i−1)⁻ᵀ,
 
-and the blocks of Σ = A⁻¹ inside the band from one sweep back, without the rest of the inverse (Takahashi,
-Fagan and Chin 1973; Erisman and Tinney 1975; Rue, Martino and Chopin 2009 take the marginal variances of
-latent Gaussian models from it):
+substitution runs through them, and the blocks of Σ = A⁻¹ inside the band follow from one sweep back,
+without the rest of the inverse (Takahashi, Fagan and Chin 1973; Erisman and Tinney 1975; Rue, Martino and
+Chopin 2009 take the marginal variances of latent Gaussian models from it):
 
     Σ_ii = D_i⁻¹ + G_i Σ_(i+1,i+1) G_iᵀ,   Σ_(i,i+1) = −G_i Σ_(i+1,i+1),   G_i = D_i⁻¹ A_(i,i+1),
 
@@ -33,8 +33,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from scipy.linalg.blas import dgemm, dsyrk, dtrsm
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg.lapack import dpbtrf, dpotrf, dtrtri
 
 
 class NotPositiveDefinite(np.linalg.LinAlgError):
@@ -94,10 +95,8 @@ class ArrowFactor:
         self._n_lags = len(blocks)
         self._group = max(1, min(len(blocks), n) - 1)  # frames in a super-block
         self._count = -(-n // self._group)
-        diagonal, lower = self._gather(blocks)
-        if not all(np.isfinite(part).all() for part in (diagonal, lower, arrow, corner)):
-            raise NotPositiveDefinite("the matrix has entries that are not finite")
-        self._factors, self._couplings = self._factorise(diagonal, lower)
+        _check_finite(arrow, np.tril(corner))
+        self._factors, self._couplings = self._factorise(blocks)
         self._arrow = self._padded(arrow)
         if self._arrow.size:
             self._arrow = self._forward(self._arrow)  # L⁻¹B
@@ -154,21 +153,6 @@ class ArrowFactor:
         for row in range(self._group):
             yield row, (row - lag) % self._group, row >= lag
 
-    def _gather(self, blocks: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Super-blocks A_ii (lower triangles) and A_(i,i−1), each (count, S, S); the end is padded with I."""
-        (n, size, _), group, count = self.shape, self._group, self._count
-        diagonal, lower = np.zeros((2, count, group, size, group, size))
-        for lag, block in enumerate(blocks[: group + 1]):
-            padded = np.zeros((count * group, size, size))
-            padded[:n] = block
-            if lag == 0:
-                padded[n:] = np.eye(size)
-            for row, column, same in self._places(lag):
-                (diagonal if same else lower)[:, row, :, column] = padded[row::group]
-        lower[0] = 0.0  # frames before the first
-        full = group * size
-        return diagonal.reshape(count, full, full), lower.reshape(count, full, full)
-
     def _scatter(self, diagonal: np.ndarray, lower: np.ndarray) -> list[np.ndarray]:
         """Frame blocks (N, Q, Q) of each lag from super-blocks, the inverse of :meth:`_gather`."""
         (n, size, _), group, count = self.shape, self._group, self._count
@@ -195,14 +179,38 @@ class ArrowFactor:
 
     # --- the band ----------------------------------------------------------------------------------
 
-    def _factorise(self, diagonal: np.ndarray, lower: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """L_i and W_i (W_0 unused), each (count, S, S)."""
-        for i, pivot in enumerate(diagonal):
-            if i:
-                lower[i] = _down(diagonal[i - 1], lower[i].T).T
-                pivot -= _gram(lower[i].T)
-            frames = f"frames {i * self._group} to {min((i + 1) * self._group, self.shape[0]) - 1}"
-            diagonal[i] = _factor(pivot, frames)
+    def _factorise(self, blocks: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """L_i and W_i (W_0 unused), each (count, S, S); the end is padded with I."""
+        (n, size, _), frames = self.shape, self._count * self._group
+        width = (self._group + 1) * size - 1  # of the band, below its diagonal
+        band = np.zeros((frames * size, width + 1))  # row j holds A(j, j), A(j + 1, j), …
+        for lag, block in enumerate(blocks[: self._group + 1]):
+            # A(i, j) stands at i + j · width of the flat array: a block is a view with these strides
+            place = _view(band, lag * size, (frames - lag, size, size), (size * (width + 1), 1, width))
+            if lag == 0:
+                place[:n] = np.tril(block)  # first: what is above the diagonal falls into other blocks
+                place[n:] = np.eye(size)
+            else:
+                place[: n - lag] = block[lag:]
+        _check_finite(band)
+        factor, info = dpbtrf(band.T, lower=1, overwrite_ab=1)
+        if info:
+            frame = (info - 1) // size
+            raise NotPositiveDefinite(f"the matrix is not positive definite at frame {frame}")
+        return self._super_blocks(factor.T, width)
+
+    def _super_blocks(self, band: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+        """Super-blocks of a factor in banded storage (columns of the matrix by row)."""
+        full = self._group * self.shape[1]
+        shape, strides = (self._count, full, full), (full * (width + 1), 1, width)
+        row, column = np.indices((full, full))
+        lower = np.zeros(shape)
+        inside = full + row - column <= width
+        if self._count > 1:
+            between = _view(band, full, (self._count - 1, full, full), strides)
+            np.copyto(lower[1:], between, where=inside)
+        diagonal = np.zeros(shape)
+        np.copyto(diagonal, _view(band, 0, shape, strides), where=row >= column)
         return diagonal, lower
 
     def _forward(self, values: np.ndarray) -> np.ndarray:
@@ -236,6 +244,17 @@ class ArrowFactor:
                 carried = _product(gain, lower[i + 1], transposed=True)
                 diagonal[i] -= 0.5 * (carried + carried.T)
         return diagonal, lower
+
+
+def _check_finite(*parts: np.ndarray) -> None:
+    if not all(np.isfinite(part.sum()) for part in parts):
+        raise NotPositiveDefinite("the matrix has entries that are not finite")
+
+
+def _view(array: np.ndarray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> np.ndarray:
+    """A view of a contiguous array with strides counted in entries."""
+    flat = array.reshape(-1)[offset:]
+    return as_strided(flat, shape, tuple(8 * s for s in strides))
 
 
 # BLAS and LAPACK hold matrices by column, NumPy by row: each is handed its transpose, which costs no copy.

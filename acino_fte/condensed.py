@@ -53,10 +53,10 @@ class Condensed:
         self._linear: Linearised | None = None
         self._found: list[Evaluation] = []
 
-    def use_exact(self) -> None:
-        """Use the exact Hessian from now on."""
-        if not self.exact:
-            self.exact = True
+    def use_exact(self, exact: bool = True) -> None:
+        """Use the exact Hessian from now on, or the Gauss–Newton one again."""
+        if self.exact != exact:
+            self.exact = exact
             self._at = None
 
     # --- the solver's variables --------------------------------------------------------------------

@@ -24,6 +24,7 @@ import numpy as np
 from acino_fte.arrow import NotPositiveDefinite
 from acino_fte.assignments import Assignment, resolve
 from acino_fte.association import ASSOCIATIONS, in_view
+from acino_fte.condensed_solve import minimise
 from acino_fte.contact import contact_terms
 from acino_fte.diagnosis import diagnose
 from acino_fte.errors import InputError
@@ -37,7 +38,7 @@ from acino_fte.posterior import Posterior, posterior
 from acino_fte.problem import Assumptions, FTEOptions, FTEProblem, build_fte
 from acino_fte.result import FTEResult, Status
 from acino_fte.sequence import Sequence
-from acino_fte.solve import Minimum, Progress, SolveOptions, minimise, predicted_pixels, rates
+from acino_fte.solve import Minimum, Progress, SolveOptions, predicted_pixels, rates
 from acino_fte.terms import Term
 from acino_fte.tune import tune
 

@@ -252,18 +252,28 @@ class _Sums:
 
     def _outer(self, node: Node, others: list[Slot], values: np.ndarray) -> None:
         """Add values (K, 3, p) of a node and p parameters to what has been gathered for positions."""
-        fixed = [other.item for other in others if other.item is not None]
-        shape = (self.whole.shape[0] * self.whole.n_markers, 3)
-        if len(set(fixed)) == len(others):
-            total = (node.scatter @ values.reshape(len(values), -1)).reshape(*shape, len(fixed))
-            key = tuple(fixed)
-            self.outer[key] = self.outer[key] + total if key in self.outer else total
-            return
-        for i, other in enumerate(others):
-            for item in np.unique(other.items).tolist():
-                chosen = np.where((other.items == item)[:, None], values[:, :, i], 0.0)
-                total = (node.scatter @ chosen)[..., None]
-                self.outer[(item,)] = self.outer[(item,)] + total if (item,) in self.outer else total
+        same: dict[int, int] = {}  # parameters that every instance has, and their columns
+        for column, other in enumerate(others):
+            if other.item is not None and other.item not in same:
+                same[other.item] = column
+            else:
+                self._spread(node, other, values[:, :, column])
+        if same:
+            chosen = values if len(same) == len(others) else values[:, :, list(same.values())]
+            total = node.scatter @ chosen.reshape(len(chosen), -1)
+            self._keep(tuple(same), total)
+
+    def _spread(self, node: Node, other: Slot, values: np.ndarray) -> None:
+        """The same for a parameter that differs between instances, values (K, 3)."""
+        items, place = np.unique(other.items, return_inverse=True)
+        total = np.zeros((node.scatter.shape[0], 3, len(items)))
+        cells = node.scatter.tocoo()
+        np.add.at(total, (cells.row, slice(None), place[cells.col]), cells.data[:, None] * values[cells.col])
+        self._keep(tuple(items.tolist()), total)
+
+    def _keep(self, key: tuple[int, ...], total: np.ndarray) -> None:
+        total = total.reshape(-1, 3, len(key))
+        self.outer[key] = self.outer[key] + total if key in self.outer else total
 
     def _general(self, first: Slot, second: Slot, part: np.ndarray) -> None:
         """Two markers, or a marker and a degree of freedom, of one residual: every instance by itself."""

@@ -9,12 +9,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from acino_fte.condensed_solve import minimise
 from acino_fte.kinematics import Kinematics
 from acino_fte.losses import Loss
 from acino_fte.problem import FTEOptions, build_problem
 from acino_fte.result import Status
 from acino_fte.sequence import Sequence
-from acino_fte.solve import SolveOptions, minimise
+from acino_fte.solve import SolveOptions
 from acino_fte.terms import point_term
 from acino_fte.triangulate import check_any, triangulate
 

@@ -213,16 +213,18 @@ def _markers(
     """Covariance of the markers (N, M, 3, 3), and theirs with the other parameters (N, M, 3, P − K)."""
     linear = problem.kinematics.linearise(minimum.q, problem.proportions(minimum.theta))
     jacobian, kinematic = linear.jacobian, problem.parameters.n_kinematic  # (N, M, 3, Q)
-    result = (jacobian @ q[:, None]) @ jacobian.swapaxes(-1, -2)
-    with_cameras = jacobian @ cross[:, None, :, kinematic:]
+    n, m, _, d = jacobian.shape
+    rows = jacobian.reshape(n, 3 * m, d)
+    result = (rows @ q).reshape(jacobian.shape) @ jacobian.swapaxes(-1, -2)
+    with_cameras = (rows @ cross[:, :, kinematic:]).reshape(n, m, 3, -1)
     g = linear.growth.shape[-1]
-    for m in range(jacobian.shape[1] if kinematic else 0):
-        own = np.arange(g + 3 * m, g + 3 * m + 3) if linear.rotations.shape[1] else np.empty(0, dtype=int)
+    for i in range(m if kinematic else 0):
+        own = np.arange(g + 3 * i, g + 3 * i + 3) if linear.rotations.shape[1] else np.empty(0, dtype=int)
         places = np.concatenate([np.arange(g), own])
-        parts = [linear.growth[:, m]] + ([linear.rotations[:, m]] if len(own) else [])
+        parts = [linear.growth[:, i]] + ([linear.rotations[:, i]] if len(own) else [])
         k = np.concatenate(parts, axis=-1)  # (N, 3, places)
-        mixed = jacobian[:, m] @ cross[:, :, places] @ k.swapaxes(-1, -2)
-        result[:, m] += mixed + mixed.swapaxes(-1, -2)
-        result[:, m] += k @ theta[np.ix_(places, places)] @ k.swapaxes(-1, -2)
-        with_cameras[:, m] += k @ theta[places, kinematic:]
+        mixed = jacobian[:, i] @ cross[:, :, places] @ k.swapaxes(-1, -2)
+        result[:, i] += mixed + mixed.swapaxes(-1, -2)
+        result[:, i] += k @ theta[np.ix_(places, places)] @ k.swapaxes(-1, -2)
+        with_cameras[:, i] += k @ theta[places, kinematic:]
     return result, with_cameras

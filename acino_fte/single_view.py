@@ -18,17 +18,18 @@ from scipy.interpolate import CubicSpline
 
 from acino_fte.association import associate
 from acino_fte.cameras import Camera
+from acino_fte.condensed_solve import minimise
 from acino_fte.depth import DepthData, MarkerDepths, depth_terms, expected_surface
 from acino_fte.errors import InputError
 from acino_fte.initialise import pose_start
 from acino_fte.kinematics import Kinematics
 from acino_fte.losses import Loss
 from acino_fte.parameters import Parameters
-from acino_fte.problem import FTEOptions, build_problem
+from acino_fte.problem import FTEOptions, FTEProblem, build_problem
 from acino_fte.result import Status
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton
-from acino_fte.solve import Minimum, SolveOptions, minimise
+from acino_fte.solve import Minimum, SolveOptions
 from acino_fte.terms import measurement_term
 
 TURNS = (0.0, 0.5, -0.5, np.pi)
@@ -44,7 +45,11 @@ _SIZE_SD = 0.15  # how far from the species' size an animal is, and how wrong a 
 _DRIFT = 0.05  # per √s: how the error of the size changes while the animal turns
 _TOLERANCE = 0.6  # m: half the depth of an animal and its lean
 _ENOUGH = 3e-3  # relative decrease of the objective per iteration below which the start is good enough
-_ITERATIONS = 12  # a right heading is there after ten
+_LOOK, _ITERATIONS = (
+    4,
+    12,
+)  # Newton steps before headings are compared, and all: a right one is there after six
+_BEHIND = 1.2  # a heading whose objective is so many times the least after the look is given up
 _FARTHEST = 3000.0  # m: a larger distance means detections that are all at one point
 _SIZES = (0.6, 1.6)  # how far from the species' size an animal may be
 
@@ -65,20 +70,28 @@ def single_view_trajectory(sequence: Sequence, kinematics: Kinematics, options: 
     depth = animal_depth(part, kinematics, pixels)
     points = camera.back_project(np.nan_to_num(pixels), depth[:, None])
     points = np.where(np.isfinite(pixels).all(-1)[..., None], points, np.nan)
-    best: Minimum | None = None
-    for turn in TURNS:
-        start = pose_start(kinematics, points, turn)
-        found = _fit(part, kinematics, options, pixels, depth, start)
-        if found.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt  # a start that was cut off is nothing to keep
-        if best is None or found.objective < best.objective:
-            best = found
-    assert best is not None
-    q = best.q
+    q = _best_heading(
+        [
+            (_problem(part, kinematics, options, pixels, depth, start), start)
+            for start in (pose_start(kinematics, points, turn) for turn in TURNS)
+        ]
+    )
     if stride > 1:
         q = CubicSpline(np.arange(0, sequence.n_frames, stride), q, axis=0)(np.arange(sequence.n_frames))
     dofs = kinematics.skeleton.dofs
     return np.clip(q, [d.lower for d in dofs], [d.upper for d in dofs])
+
+
+def _best_heading(starts: list[tuple[FTEProblem, np.ndarray]]) -> np.ndarray:
+    """The best of the fits (N, Q) from several headings; those that fall behind are not finished."""
+    first = [_fit(problem, start, _LOOK) for problem, start in starts]
+    limit = _BEHIND * min(found.objective for found in first)
+    better = [
+        _fit(problem, found.q, _ITERATIONS - _LOOK)
+        for (problem, _), found in zip(starts, first, strict=True)
+        if found.objective <= limit
+    ]
+    return min(better, key=lambda found: found.objective).q
 
 
 def _thinned(sequence: Sequence, stride: int) -> Sequence:
@@ -257,24 +270,31 @@ def _running_median(
     return np.interp(every, every[known], result[known])
 
 
-def _fit(
+def _problem(
     sequence: Sequence,
     kinematics: Kinematics,
     options: FTEOptions,
     pixels: np.ndarray,
     depth: np.ndarray,
     start: np.ndarray,
-) -> Minimum:
-    """A rough fit of image and depth from a start (N, Q)."""
+) -> FTEProblem:
+    """The problem of a rough fit of image and depth; returns are associated at a start (N, Q)."""
     camera, skeleton = sequence.cameras[0], kinematics.skeleton
     focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
     spread = np.full(len(skeleton.markers), _SPREAD * focal / float(np.median(depth)))
     term = measurement_term(camera, pixels, spread, Loss("cauchy", {"c": 2.0}), sequence.n_frames)
     assert term is not None
     terms = [term, *_depth_terms(sequence, kinematics, camera, pixels, depth, start)]
-    problem = build_problem(kinematics, sequence.fps, sequence.frames, terms, options)
-    settings = SolveOptions(max_iter=_ITERATIONS, tolerance=1.0, acceptable_tolerance=10.0)
-    return minimise(problem, start, settings, enough=_ENOUGH)
+    return build_problem(kinematics, sequence.fps, sequence.frames, terms, options)
+
+
+def _fit(problem: FTEProblem, start: np.ndarray, iterations: int) -> Minimum:
+    """A rough fit from a start (N, Q)."""
+    settings = SolveOptions(max_iter=iterations, tolerance=1.0, acceptable_tolerance=10.0)
+    found = minimise(problem, start, settings, enough=_ENOUGH)
+    if found.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt  # a start that was cut off is nothing to keep
+    return found
 
 
 def _depth_terms(

@@ -1,18 +1,14 @@
-"""Solving: the condensed problem through cyipopt, with one set of options and an honest status."""
+"""Solving: one set of options for both lowerings, and an honest status."""
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from acino_fte.condensed import Condensed
 from acino_fte.errors import InputError
 from acino_fte.parameters import describe
 from acino_fte.prediction import corrected_cameras, predict, time_offsets
@@ -125,99 +121,6 @@ class Minimum:
     multipliers: np.ndarray | None = None
 
 
-class _Callbacks:
-    """What IPOPT calls: the condensed problem, progress, and the best iterate so far."""
-
-    def __init__(self, condensed: Condensed, progress: Progress | None, enough: float, refine: bool) -> None:
-        self.condensed = condensed
-        self.refine = refine
-        self.progress = progress
-        self.enough = enough
-        self.stop = False
-        self.iterations = 0
-        self.best = (np.inf, np.empty(0))
-        self._last = np.inf
-        self._slow = 0
-
-    def objective(self, x: np.ndarray) -> float:
-        """Value, remembered when it is the best so far."""
-        value = self.condensed.objective(x)
-        if value < self.best[0]:
-            self.best = (value, x.copy())
-        return value
-
-    def gradient(self, x: np.ndarray) -> np.ndarray:
-        """∂f/∂x."""
-        return self.condensed.gradient(x)
-
-    def hessianstructure(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of the lower triangle."""
-        return self.condensed.structure
-
-    def hessian(self, x: np.ndarray, _multipliers: np.ndarray, factor: float) -> np.ndarray:
-        """Entries of the lower triangle."""
-        return factor * self.condensed.hessian(x)
-
-    def intermediate(self, _mode: int, iteration: int, value: float, *_: float) -> bool:
-        """After each iteration: report, and stop when asked to."""
-        self.iterations = iteration
-        if self.progress is not None:
-            self.progress(iteration, value)
-        gain = (self._last - value) / abs(value) if value else 0.0
-        self._last = value
-        self._slow = self._slow + 1 if 0 <= gain < self.enough else 0
-        if self.refine and iteration >= _PATIENCE and 0 <= gain < _NEAR:
-            self.condensed.use_exact()
-        return not (self.stop or self._slow >= _SLOW)
-
-
-def minimise(
-    problem: FTEProblem,
-    start: np.ndarray,
-    options: SolveOptions | None = None,
-    progress: Progress | None = None,
-    enough: float = 0.0,
-    theta: np.ndarray | None = None,
-) -> Minimum:
-    """Minimise a problem from q (N, Q) and θ (P,), zero when left out, by its condensed lowering.
-
-    Ctrl-C ends it with the best iterate so far and the status ``interrupted``. ``enough`` stops it early,
-    ``acceptable``, once two iterations in a row lower the objective by less than this fraction: for a start,
-    not for a result.
-    """
-    import cyipopt
-
-    options = options or SolveOptions()
-    condensed = Condensed(problem, exact=options.hessian == "exact")
-    callbacks = _Callbacks(condensed, progress, enough, refine=options.hessian == "auto" and not enough)
-    x0 = condensed.pack(problem.clip(start), np.zeros(condensed.n_parameters) if theta is None else theta)
-    lower, upper = bounds(problem)
-    solver = cyipopt.Problem(n=x0.size, m=0, problem_obj=callbacks, lb=lower, ub=upper)
-    for name, value in {**options.ipopt(), **_STRATEGY}.items():
-        solver.add_option(name, value)
-    with _stop_on_interrupt(callbacks):
-        x, info = solver.solve(x0)
-    status = IPOPT_STATUS.get(info["status"], Status.FAILED)
-    if status is Status.INTERRUPTED and not callbacks.stop:
-        status = Status.ACCEPTABLE  # near enough to its minimum
-    check_linear_solver(status, callbacks.iterations, options)
-    value = float(info["obj_val"])
-    if not status.ok and callbacks.best[0] < np.inf:
-        value, x = callbacks.best
-    q, found = condensed.unpack(np.clip(x, lower, upper))
-    multipliers = info["mult_x_L"] + info["mult_x_U"]
-    return Minimum(status, q, value, callbacks.iterations, found, multipliers)
-
-
-def bounds(problem: FTEProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the solver's variables (:mod:`acino_fte.condensed`), ±1e20 for none."""
-    beyond = problem.parameters.bound / problem.parameters.sd
-    lower = np.where(np.isfinite(problem.lower), problem.lower, -1e20)
-    upper = np.where(np.isfinite(problem.upper), problem.upper, 1e20)
-    n = problem.n_frames
-    return np.concatenate([np.tile(lower, n), -beyond]), np.concatenate([np.tile(upper, n), beyond])
-
-
 def check_linear_solver(status: Status, iterations: int, options: SolveOptions) -> None:
     """Raise InputError when IPOPT never began because it has no such linear solver."""
     if status is Status.FAILED and not iterations and options.linear_solver != "mumps":
@@ -226,41 +129,6 @@ def check_linear_solver(status: Status, iterations: int, options: SolveOptions) 
             key="linear_solver",
             remedy="use 'mumps', which comes with IPOPT, or install that solver's library",
         )
-
-
-# Relative decrease per iteration below which the exact Hessian takes over. Residuals are large where the
-# skeleton does not fit the animal, and Gauss–Newton steps then only crawl to the minimum.
-_NEAR = 3e-5
-_SLOW = 2  # iterations in a row with little gain: the first ones may be short while the barrier settles
-_PATIENCE = 8  # iterations: where the skeleton fits, Gauss–Newton is done by then
-
-_STRATEGY: dict[str, str | float | int] = {
-    "mu_strategy": "adaptive",
-    "mu_min": 1e-5,  # a joint at its limit costs the objective no more than this
-    "bound_push": 1e-2,
-    "bound_frac": 1e-2,
-    "mumps_mem_percent": 50,  # enough without delayed pivots; IPOPT enlarges it when it is not
-    "mumps_pivot_order": 6,  # minimum degree that knows dense rows: parameters stand in every frame
-    "mumps_permuting_scaling": 0,  # the Hessian is positive semidefinite and well scaled as it is
-    "mumps_scaling": 0,
-}
-
-
-@contextmanager
-def _stop_on_interrupt(callbacks: _Callbacks) -> Iterator[None]:
-    """Let the first Ctrl-C end the solve in good order instead of tearing through IPOPT."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(*_: object) -> None:
-        callbacks.stop = True
-
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def solve_fte(
@@ -299,6 +167,8 @@ def solve_fte(
     options = options or SolveOptions()
     began = time.perf_counter()
     if lowering == "condensed":
+        from acino_fte.condensed_solve import minimise
+
         minimum = minimise(problem, start, options, progress)
     elif lowering == "explicit":
         from acino_fte.explicit_solve import minimise_explicit

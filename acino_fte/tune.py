@@ -35,10 +35,11 @@ from functools import cache
 import numpy as np
 
 from acino_fte.arrow import NotPositiveDefinite
+from acino_fte.condensed_solve import minimise
 from acino_fte.losses import Loss
 from acino_fte.posterior import Posterior, posterior
 from acino_fte.problem import FTEProblem
-from acino_fte.solve import Minimum, minimise
+from acino_fte.solve import Minimum
 from acino_fte.terms import Term
 
 WIDTH = 2.0  # standard deviation of the prior of log(factor)

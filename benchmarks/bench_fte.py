@@ -95,10 +95,10 @@ def in_fresh_process(n_frames: int, repeats: int) -> dict[str, Any]:
 
 def explicit_case(n_frames: int) -> dict[str, Any]:
     """The explicit model: build, write and solve, against the condensed one from the same start."""
+    from acino_fte.condensed_solve import minimise
     from acino_fte.explicit import build_explicit
     from acino_fte.initialise import initial_trajectory
     from acino_fte.problem import build_fte
-    from acino_fte.solve import minimise
 
     sequence, kinematics = make_sequence(n_frames)
     problem = build_fte(sequence, kinematics)

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from acino_fte.assignments import HYSTERESIS, KEEP, RARE, Assignment, limb_groups, resolve, viterbi
+from acino_fte.condensed_solve import minimise
 from acino_fte.initialise import initial_trajectory
 from acino_fte.kinematics import load_kinematics
 from acino_fte.losses import Loss
 from acino_fte.problem import Assumptions, FTEOptions, build_fte
 from acino_fte.simulate import SimulationOptions, simulate, simulation_to_sequence
 from acino_fte.skeleton import Skeleton, expand, load_skeleton
-from acino_fte.solve import minimise
 from acino_fte.species_file import SpeciesFile
 
 N, C = 12, 3

@@ -15,6 +15,7 @@ from test_posterior import covariance
 from test_recovery import parameter_nees
 
 from acino_fte.condensed import Condensed
+from acino_fte.condensed_solve import minimise
 from acino_fte.estimate import EstimateOptions, estimate_fte
 from acino_fte.losses import Loss
 from acino_fte.metrics_truth import ELLIPSOID, normalised_errors, truth_vectors
@@ -22,7 +23,6 @@ from acino_fte.parameters import PriorWidths
 from acino_fte.posterior import MOST_LEVERAGE, leverage, posterior
 from acino_fte.problem import FTEOptions
 from acino_fte.simulate import SimulationOptions, simulate, simulation_to_sequence
-from acino_fte.solve import minimise
 
 WIDTH = 0.25  # of the joints' prior: at twice half a joint's range, as by default, draws leave the range
 

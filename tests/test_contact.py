@@ -10,6 +10,7 @@ from test_condensed import assert_close, away, dense, numeric_gradient, numeric_
 
 from acino_fte import contact
 from acino_fte.condensed import Condensed
+from acino_fte.condensed_solve import minimise
 from acino_fte.explicit import build_explicit
 from acino_fte.initialise import initial_trajectory
 from acino_fte.kinematics import load_kinematics
@@ -17,7 +18,6 @@ from acino_fte.losses import Loss
 from acino_fte.problem import build_fte
 from acino_fte.simulate import SimulationOptions, simulate, simulation_to_sequence
 from acino_fte.skeleton import expand
-from acino_fte.solve import minimise
 from acino_fte.species_file import SpeciesFile
 
 LEVEL = (0.0, 0.0, 1.0, 0.0)

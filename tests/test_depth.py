@@ -9,6 +9,7 @@ from conftest import cameras_about, make_sequence, random_motion
 from test_global_parameters import check_derivatives
 
 from acino_fte.condensed import Condensed
+from acino_fte.condensed_solve import minimise
 from acino_fte.depth import (
     COMMON,
     LIMB,
@@ -29,7 +30,7 @@ from acino_fte.parameters import Parameters, with_surface
 from acino_fte.prediction import corrected_cameras, positions_at
 from acino_fte.problem import Assumptions, FTEOptions, build_fte
 from acino_fte.skeleton import load_skeleton
-from acino_fte.solve import SolveOptions, minimise
+from acino_fte.solve import SolveOptions
 
 N = 5
 TIGHT = SolveOptions(tolerance=1e-4, acceptable_tolerance=1e-3)

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from acino_fte import camera_residuals, diagnosis
+from acino_fte.condensed_solve import minimise
 from acino_fte.data_tools.load import load_sequence
 from acino_fte.initialise import initial_trajectory
 from acino_fte.prediction import corrected
 from acino_fte.problem import build_fte
 from acino_fte.simulate import SimulationOptions, simulate, simulation_to_sequence
-from acino_fte.solve import SolveOptions, minimise
+from acino_fte.solve import SolveOptions
 from acino_fte.triangulate import triangulate
 
 FOLDER = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "lily_run"

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from acino_fte.condensed_solve import minimise
 from acino_fte.errors import InputError
 from acino_fte.estimate import EstimateOptions, estimate_fte
 from acino_fte.evaluate import climb, evaluate_holdout, fitted_families
@@ -14,7 +15,7 @@ from acino_fte.problem import FTEOptions, build_fte
 from acino_fte.result import Status
 from acino_fte.simulate import SimulationOptions, simulate, simulation_to_sequence
 from acino_fte.skeleton import load_skeleton
-from acino_fte.solve import SolveOptions, minimise, solve_fte
+from acino_fte.solve import SolveOptions, solve_fte
 
 PLAIN = EstimateOptions(fit=(), noise="table", swaps=False, covariance=False)
 

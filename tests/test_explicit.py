@@ -15,6 +15,7 @@ from conftest import FPS, random_problem
 from pyomo.core.expr import Expr_if
 
 from acino_fte.condensed import Condensed
+from acino_fte.condensed_solve import minimise
 from acino_fte.errors import InputError
 from acino_fte.explicit import build_explicit, read_states
 from acino_fte.explicit_solve import ROUTES, PyomoToCasadi, available_route, minimise_explicit, solve_explicit
@@ -23,7 +24,7 @@ from acino_fte.losses import DEFAULTS, Loss
 from acino_fte.problem import build_fte
 from acino_fte.result import Status
 from acino_fte.simulate import SimulationOptions, simulate, simulation_to_sequence
-from acino_fte.solve import SolveOptions, minimise, solve_fte
+from acino_fte.solve import SolveOptions, solve_fte
 
 TIGHT = SolveOptions(tolerance=1e-4, acceptable_tolerance=1e-3)
 

@@ -8,6 +8,7 @@ from conftest import FPS, cameras_about, make_sequence, random_motion
 from test_global_parameters import fitted, mixed_term, tied_term
 
 from acino_fte.condensed import Condensed
+from acino_fte.condensed_solve import minimise
 from acino_fte.explicit import build_explicit, read_parameters, read_states
 from acino_fte.explicit_solve import PyomoToCasadi, minimise_explicit
 from acino_fte.losses import Loss
@@ -15,7 +16,7 @@ from acino_fte.parameters import FAMILIES, cayley_matrix
 from acino_fte.prediction import corrected, predict
 from acino_fte.problem import FTEOptions, build_fte
 from acino_fte.result import Status
-from acino_fte.solve import SolveOptions, minimise
+from acino_fte.solve import SolveOptions
 
 TIGHT = SolveOptions(tolerance=1e-4, acceptable_tolerance=1e-3)
 

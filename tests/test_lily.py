@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import acino_fte.evaluate
 import acino_fte.methods
 from acino_fte.cli import app
+from acino_fte.condensed_solve import minimise
 from acino_fte.data_tools.load import load_sequence
 from acino_fte.imperfections import corrected_cameras
 from acino_fte.initialise import initial_trajectory
@@ -19,7 +20,7 @@ from acino_fte.kinematics import load_kinematics
 from acino_fte.prediction import predict
 from acino_fte.problem import build_fte
 from acino_fte.skeleton import load_skeleton
-from acino_fte.solve import SolveOptions, minimise
+from acino_fte.solve import SolveOptions
 
 FOLDER = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "lily_run"
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from conftest import FPS, cameras_about, make_sequence, random_motion
 
+from acino_fte.condensed_solve import minimise
 from acino_fte.initialise import initial_trajectory
 from acino_fte.noise import PRIOR_COUNT, estimate_noise, robust_scale
 from acino_fte.posterior import posterior
 from acino_fte.prior_motion import prior_motion
 from acino_fte.problem import Assumptions, FTEOptions, build_fte
 from acino_fte.simulate import SimulationOptions, simulate, simulation_to_sequence
-from acino_fte.solve import minimise
 
 # --- the scale of a sample ---------------------------------------------------------------------------
 

@@ -11,13 +11,14 @@ from test_global_parameters import fitted
 from acino_fte import posterior as module
 from acino_fte.arrow import NotPositiveDefinite
 from acino_fte.condensed import Condensed
+from acino_fte.condensed_solve import minimise
 from acino_fte.losses import Loss
 from acino_fte.parameters import FAMILIES
 from acino_fte.posterior import factorise, posterior
 from acino_fte.prior_motion import prior_motion
 from acino_fte.problem import Assumptions, FTEOptions, build_fte, build_problem
 from acino_fte.result import Status
-from acino_fte.solve import Minimum, SolveOptions, minimise
+from acino_fte.solve import Minimum, SolveOptions
 from acino_fte.terms import point_term
 
 TIGHT = SolveOptions(tolerance=1e-5, acceptable_tolerance=1e-4)

@@ -215,16 +215,16 @@ def test_an_explicit_run_out_of_iterations(recording, here):
 
 INTERRUPT = """
 import os, signal, sys
-from acino_fte import solve
+from acino_fte import condensed_solve
 
-report = solve._Callbacks.intermediate
+report = condensed_solve._Callbacks.after
 
-def intermediate(self, mode, iteration, *rest):
+def after(self, iteration, *rest):
     if iteration == {iteration} and {when}:
         os.kill(os.getpid(), signal.SIGINT)
-    return report(self, mode, iteration, *rest)
+    return report(self, iteration, *rest)
 
-solve._Callbacks.intermediate = intermediate
+condensed_solve._Callbacks.after = after
 sys.argv = ["acino-fte", "run", *sys.argv[1:]]
 from acino_fte.cli import main
 main()
@@ -247,7 +247,7 @@ def test_an_interrupted_run_is_saved_and_marked(recording, here):
 def test_an_interrupted_first_fit_is_saved_and_marked(recording, here):
     """The rough fit that noise and sides are judged by: what it had is kept, and nothing follows."""
     code = INTERRUPT.format(iteration=1, when="self.enough == estimate._ROUGH")
-    code = code.replace("from acino_fte import solve", "from acino_fte import estimate, solve")
+    code = code.replace("import condensed_solve", "import condensed_solve, estimate")
     done = start(sys.executable, "-c", code, str(recording), "--no-figures", cwd=here)
     assert done.returncode == 3, done.stderr
     metrics = json.loads((here / "out" / "gallop" / "metrics.json").read_text())

@@ -11,13 +11,14 @@ from conftest import FPS, cameras_about, make_sequence, random_motion, random_pr
 from scipy.optimize import least_squares
 
 from acino_fte.condensed import Condensed
+from acino_fte.condensed_solve import minimise
 from acino_fte.errors import InputError
 from acino_fte.initialise import initial_trajectory
 from acino_fte.losses import DEFAULTS, Loss
 from acino_fte.problem import FTEOptions, build_fte
 from acino_fte.residuals import Handle, Residual
 from acino_fte.result import Status
-from acino_fte.solve import SolveOptions, minimise, solve_fte
+from acino_fte.solve import SolveOptions, solve_fte
 from acino_fte.terms import Term
 
 TIGHT = SolveOptions(tolerance=1e-5, acceptable_tolerance=1e-4)

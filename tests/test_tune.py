@@ -10,13 +10,13 @@ from scipy.stats import multivariate_normal
 from test_condensed import away, dense
 
 from acino_fte.condensed import Condensed
+from acino_fte.condensed_solve import minimise
 from acino_fte.losses import DEFAULTS, Loss
 from acino_fte.posterior import posterior
 from acino_fte.prior_motion import prior_motion, prior_precision, process_noise
 from acino_fte.problem import Assumptions, FTEOptions, build_fte, build_problem
 from acino_fte.residuals import Handle, Residual
 from acino_fte.result import Status
-from acino_fte.solve import minimise
 from acino_fte.terms import Term
 from acino_fte.tune import WIDTH, evidence, jump_moments, tune, with_data_weight
 
