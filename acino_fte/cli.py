@@ -8,6 +8,7 @@ from acino_fte import (
     cli_adjust,
     cli_calibrate,
     cli_compare,
+    cli_doctor,
     cli_histograms,
     cli_import,
     cli_match,
@@ -38,6 +39,7 @@ app.command("calibrate-lidar")(cli_calibrate.calibrate_lidar)
 app.command("camera-motion")(cli_motion.camera_motion)
 app.command("import-recording")(cli_import.import_recording)
 app.command("adjust")(cli_adjust.adjust)
+app.command("doctor")(cli_doctor.doctor)
 app.command("histograms")(cli_histograms.histograms)
 app.add_typer(cli_skeleton.app, name="skeleton")
 
