@@ -205,7 +205,7 @@ class Encoder:
         self.save(at_rest=self._resting)
 
     def interrupted(self) -> None:
-        """The source was gone, as a microcontroller that was unplugged: its counter may start again from 0."""
+        """The source was gone, as a microcontroller that was unplugged: its counter may start from 0."""
         self._doubt = True
 
     def save(self, *, at_rest: bool) -> None:

@@ -108,7 +108,7 @@ class GpiodEdges:
             self._request = gpiod.request_lines(
                 path, {tuple(lines): settings}, consumer="acino-fte", event_buffer_size=4096
             )
-            values = self._request.get_values(list(lines[:2]))
+            values = self._request.get_values([lines[0], lines[1]])
         except (OSError, ValueError) as error:
             raise InputError(
                 "The lines of an encoder cannot be opened.",
@@ -118,7 +118,8 @@ class GpiodEdges:
                 remedy="see gpioinfo for names and users of lines; the user must be in the group gpio",
             ) from None
         self._rising = gpiod.EdgeEvent.Type.RISING_EDGE
-        self.levels = tuple(int(value == gpiod.line.Value.ACTIVE) for value in values)
+        a, b = (int(value == gpiod.line.Value.ACTIVE) for value in values)
+        self.levels = (a, b)
         self._number = 0
 
     def read(self) -> EdgeBatch:
