@@ -9,13 +9,13 @@ Plain, as rigs in the field speak it: ASCII, a message a line.
 ``r<motor><turns>``      from the device: the same in turns of the output shaft, decimal
 =======================  =====================================================================
 
-A motor's number is *one* digit, 1–9; what follows is the value. So ``t1200`` is motor 1 at 200, never motor 12;
-``t1-200`` is motor 1 at -200. A value has one spelling: no ``+``, no leading zero, no ``-0``, no space.
+A motor's number is *one* digit, 1–9; what follows is the value. So ``t1200`` is motor 1 at 200, never motor
+12; ``t1-200`` is motor 1 at -200. A value has one spelling: no ``+``, no leading zero, no ``-0``, no space.
 What is spelt otherwise, or is out of range, is refused, never clipped.
 
-Framed: ``$<seq><message>*<crc>``, for instance ``$05t1-200*1374``. `seq` counts the sender's lines modulo 256, two
-digits; `crc` is CRC-16/CCITT-FALSE (polynomial 0x1021, begins with 0xFFFF) of `seq` and message, four digits;
-both hexadecimal with capitals. A receiver of framed lines refuses plain ones.
+Framed: ``$<seq><message>*<crc>``, for instance ``$05t1-200*2481``. `seq` counts the sender's lines modulo
+256, two digits; `crc` is CRC-16/CCITT-FALSE (polynomial 0x1021, begins with 0xFFFF) of `seq` and message,
+four digits; both hexadecimal with capitals. A receiver of framed lines refuses plain ones.
 """
 
 from __future__ import annotations
@@ -184,18 +184,19 @@ class PlainLines:
 
     def _message(self, text: bytes) -> Message | None:
         message = parse(text)
-        if (
-            message is None
-            or (isinstance(message, Throttle | Reset) == (self._side == "host"))
-            or not isinstance(message, Reset)
-            and message.motor not in self._motors
-        ):
+        if message is None or not self._is_for_us(message):
             self.counts.junk += 1
-        elif not in_range(message):
+            return None
+        if not in_range(message):
             self.counts.out_of_range += 1
-        else:
-            return message
-        return None
+            return None
+        return message
+
+    def _is_for_us(self, message: Message) -> bool:
+        if isinstance(message, Reset):
+            return self._side == "device"
+        side = "device" if isinstance(message, Throttle) else "host"
+        return side == self._side and message.motor in self._motors
 
 
 class FramedLines(PlainLines):

@@ -1,6 +1,7 @@
 """The lines between computer and microcontroller: nothing but a message that was sent becomes one."""
 
 from itertools import combinations
+from random import Random
 
 import numpy as np
 import pytest
@@ -21,9 +22,8 @@ from acino_fte.rig.serial_frames import (
 )
 
 N = 1_000_000
-COMMANDS = {
-    body(Throttle(motor, speed)): Throttle(motor, speed) for motor in (1, 2) for speed in range(-800, 801)
-}
+THROTTLES = [Throttle(motor, speed) for motor in (1, 2) for speed in range(-800, 801)]
+COMMANDS = {body(message): message for message in THROTTLES}
 COMMANDS[b"reset"] = Reset()
 
 
@@ -53,14 +53,17 @@ def test_messages_of_the_field():
 
 @pytest.mark.parametrize(
     "line",
-    [b"t1", b"t0100", b"t3100", b"t1+5", b"t105", b"t1-0", b"t1--5", b"t1 5", b" t15", b"T15", b"t15.0", b"t1\xb2",
-     b"t15 ", b"t15\r", b"t1-2t1-200", b"resett15", b"Reset", b"p15", b"r15", b"t1200000", b"$00t15*0000", b"\0t15"],
-)  # fmt: skip
+    [
+        *(b"t1", b"t0100", b"t3100", b"t1+5", b"t105", b"t1-0", b"t1--5", b"t1 5", b" t15", b"T15", b"t15.0"),
+        *(b"t1\xb2", b"t15 ", b"t1-2t1-200", b"resett15", b"Reset", b"p15", b"r15", b"t1200000", b"\0t15"),
+        b"$00t15*0000",
+    ],
+)
 def test_what_is_spelt_otherwise_is_refused(line):
     """Also the ambiguous ones: a motor has one digit, so t1200 is motor 1 and there is no motor 12."""
     device = PlainLines("device")
-    assert device.feed(line + b"\n") == [] or line == b"t15\r"
-    assert device.counts.junk == 1 or line == b"t15\r"
+    assert device.feed(line + b"\n") == []
+    assert device.counts.junk == 1
 
 
 def test_out_of_range_is_refused_and_not_clipped():
@@ -89,7 +92,7 @@ def test_partial_and_overlong_lines():
 
 @pytest.mark.parametrize("alphabet", [bytes(range(256)), b"t12058-\r\n", b"$*tre120358-ACF\n"])
 def test_a_million_fuzzed_bytes(alphabet):
-    """Any bytes, and bytes of which messages are made: plain takes what is a command, framed takes nothing."""
+    """Any bytes, and those of which messages are made: plain takes what is a command, framed nothing."""
     rng = np.random.default_rng(len(alphabet))
     data = rng.choice(np.frombuffer(alphabet, np.uint8), N).tobytes()
     plain, framed = PlainLines("device"), FramedLines("device")
@@ -103,21 +106,21 @@ def test_a_million_fuzzed_bytes(alphabet):
 
 
 def damaged(frames, rng):
-    """Frames with a third of them hurt: flipped bits, lost and added bytes, bursts, doubled and swapped lines."""
+    """Frames, a third of them hurt: flipped bits, lost and added bytes, bursts, doubled and swapped lines."""
     out = []
     for line in frames:
-        kind = rng.integers(0, 30)
+        kind = rng.randrange(30)
         text = bytearray(line)
-        at = int(rng.integers(0, len(text)))
+        at = rng.randrange(len(text))
         if kind < 4:
-            for place in rng.integers(0, len(text), kind + 1):
-                text[place] ^= 1 << int(rng.integers(0, 8))
+            for _ in range(kind + 1):
+                text[rng.randrange(len(text))] ^= 1 << rng.randrange(8)
         elif kind == 4:
-            del text[at : at + int(rng.integers(1, 5))]
+            del text[at : at + rng.randint(1, 4)]
         elif kind == 5:
-            text[at:at] = rng.bytes(int(rng.integers(1, 5)))
+            text[at:at] = rng.randbytes(rng.randint(1, 4))
         elif kind == 6:
-            text[at : at + 3] = rng.bytes(3)
+            text[at : at + 3] = rng.randbytes(3)
         elif kind == 7:
             text *= 2
         elif kind == 8 and out:
@@ -129,11 +132,8 @@ def damaged(frames, rng):
 def test_a_million_bytes_of_damaged_frames_give_no_wrong_command():
     rng = np.random.default_rng(11)
     n = N // 14
-    sent = [
-        Throttle(int(m), int(s))
-        for m, s in zip(rng.integers(1, 3, n), rng.integers(-800, 801, n), strict=True)
-    ]
-    data = damaged([frame(message, k % 256) for k, message in enumerate(sent)], rng)
+    sent = [THROTTLES[k] for k in rng.integers(0, len(THROTTLES), n)]
+    data = damaged([frame(message, k % 256) for k, message in enumerate(sent)], Random(11))
     assert len(data) >= N
     device = FramedLines("device")
     taken = [message for piece in pieces(data, rng) for message in device.feed(piece)]
@@ -171,14 +171,12 @@ def test_two_flipped_bits_never_make_another_command_of_a_frame():
 
 
 def test_what_plain_lines_cannot_guarantee():
-    """A flipped bit or a lost byte makes another valid command of a plain line: docs/rig_drive.md says how often."""
+    """A flipped bit or a lost byte may make another command of a plain line: how often."""
     wrong = {"flipped": [0, 0], "lost": [0, 0]}
     for text, message in [*COMMANDS.items()][::7]:
         line = text + b"\n"
-        for name, hurt in (
-            ("flipped", flips(line)),
-            ("lost", (line[:k] + line[k + 1 :] for k in range(len(line)))),
-        ):
+        shorter = [line[:k] + line[k + 1 :] for k in range(len(line))]
+        for name, hurt in (("flipped", flips(line)), ("lost", shorter)):
             for other in hurt:
                 taken = PlainLines("device").feed(other)
                 wrong[name][0] += any(command != message for command in taken)
