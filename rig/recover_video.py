@@ -1,0 +1,157 @@
+"""Rescue of videos: what FFmpeg can still walk through is copied, undecoded, into a file that was closed.
+
+An MP4 without its index goes to :mod:`recover_mp4`.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from acino_fte.data_tools.video import load_av
+from acino_fte.data_tools.video_cut import is_cut
+from acino_fte.errors import InputError
+from acino_fte.rig.recover_types import Salvaged, SavedStream
+
+FRAGMENTS = "frag_keyframe+empty_moov+default_base_moof"
+_FORMS = {"matroska,webm": "matroska", "mov,mp4,m4a,3gp,3g2,mj2": "mp4"}
+_WORDS = {"matroska": "Matroska video", "mp4": "MP4 video", "avi": "AVI video", "mpegts": "MPEG-TS video"}
+_MOST_PROBLEMS = 20
+
+
+class NoIndex(Exception):
+    """FFmpeg finds no way into the file."""
+
+
+def salvage_video(source: Path, target: Path | None) -> Salvaged:
+    """Copy every whole frame of a video that FFmpeg opens, with its time.
+
+    Parameters
+    ----------
+    source : Path
+        The video; only read.
+    target : Path, optional
+        The new file, in the same container; without it the frames are only counted.
+
+    Raises
+    ------
+    NoIndex
+        FFmpeg does not open the file.
+    """
+    av = load_av()
+    try:
+        container = av.open(str(source))
+    except (av.error.FFmpegError, ValueError, OSError) as error:
+        raise NoIndex(str(error)) from error
+    with container:
+        if not container.streams.video:
+            raise InputError("The file has no pictures.", file=source, expected="a video stream")
+        form = _FORMS.get(container.format.name, container.format.name.split(",")[0])
+        notes, damaged = _state(container, source, form)
+        if target is None:
+            count = _copied(av, container, None, notes)
+        else:
+            count = _remuxed(av, container, target, form, notes)
+        stream = container.streams.video[0]
+        streams = (_stream(stream, count),)
+        problems = damaged or count.problems or any(s.lost for s in streams)
+    return Salvaged(
+        _WORDS.get(form, f"{form} video"), not problems, streams, 0, count.bytes_lost, tuple(notes)
+    )
+
+
+def _state(container: Any, source: Path, form: str) -> tuple[list[str], bool]:
+    """Notes on a file that was cut or not closed, and whether it was."""
+    if is_cut(source):
+        return ["The file is cut: it ends before its own structure says."], True
+    if form == "matroska" and not container.duration:
+        return ["The file was not closed: its length is missing."], True
+    return [], False
+
+
+class _Count:
+    """Frames of the video stream on their way."""
+
+    def __init__(self) -> None:
+        self.n = self.bytes_lost = self.problems = 0
+        self.first: int | None = None
+        self.last: int | None = None
+
+    def add(self, packet: Any) -> None:
+        stamp = packet.pts if packet.pts is not None else packet.dts
+        if stamp is not None:
+            self.first = stamp if self.first is None else min(self.first, stamp)
+            self.last = stamp if self.last is None else max(self.last, stamp)
+        self.n += 1
+
+
+def _copied(av: Any, container: Any, out: Any, notes: list[str]) -> _Count:
+    """Walk through all packets; hand over the whole ones to `out`, a call."""
+    count, video = _Count(), container.streams.video[0]
+    packets = container.demux()
+    while True:
+        try:
+            packet = next(packets)
+        except StopIteration:
+            return count
+        except (av.error.FFmpegError, ValueError) as error:
+            count.problems += 1
+            notes.append(f"After frame {count.n - 1} the file cannot be read further ({error}).")
+            return count
+        if packet.size == 0:
+            continue
+        if packet.is_corrupt:
+            count.problems += 1
+            count.bytes_lost += packet.size
+            if count.problems <= _MOST_PROBLEMS:
+                notes.append(f"After frame {count.n - 1} a frame of {packet.size} bytes is not whole.")
+            continue
+        if packet.stream.index == video.index:
+            count.add(packet)
+        if out is not None:
+            out(packet)
+
+
+def _remuxed(av: Any, container: Any, target: Path, form: str, notes: list[str]) -> _Count:
+    """Copy the packets of all streams into a new file."""
+    base = container.streams.video[0].time_base
+    options: dict[str, str] = {}
+    if form == "mp4" and base is not None and base.numerator == 1:
+        options["video_track_timescale"] = str(base.denominator)
+    try:
+        with av.open(str(target), "w", format=form, options=options) as out:
+            streams = {}
+            for stream in container.streams:
+                if stream.type in ("video", "audio"):
+                    streams[stream.index] = out.add_stream_from_template(stream)
+                    streams[stream.index].time_base = stream.time_base
+
+            def write(packet: Any) -> None:
+                if packet.stream.index in streams:
+                    packet.stream = streams[packet.stream.index]
+                    out.mux_one(packet)
+
+            # the count sees the packet before it changes its stream
+            return _copied(av, container, write, notes)
+    except (av.error.FFmpegError, ValueError) as error:
+        raise InputError("The copy of the video cannot be written.", file=target, found=str(error)) from error
+
+
+def _stream(stream: Any, count: _Count) -> SavedStream:
+    base = stream.time_base or Fraction(1, 1000)
+    first, last = (round(t * base * 10**9) if t is not None else None for t in (count.first, count.last))
+    seconds = (last - first) / 1e9 if first is not None and last is not None else 0.0
+    lost = max((stream.frames or 0) - count.n, 0)
+    rate = float(stream.average_rate or stream.guessed_rate or 0)
+    return SavedStream(
+        "video0",
+        stream.codec_context.name,
+        count.n,
+        seconds,
+        first,
+        last,
+        lost,
+        lost / rate if rate else 0.0,
+        bool(stream.frames),
+    )
