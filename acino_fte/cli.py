@@ -13,6 +13,7 @@ from acino_fte import (
     cli_import,
     cli_match,
     cli_motion,
+    cli_rig,
     cli_run,
     cli_scene,
     cli_simulate,
@@ -42,6 +43,7 @@ app.command("adjust")(cli_adjust.adjust)
 app.command("doctor")(cli_doctor.doctor)
 app.command("histograms")(cli_histograms.histograms)
 app.add_typer(cli_skeleton.app, name="skeleton")
+app.add_typer(cli_rig.app, name="rig")
 
 
 @app.callback(invoke_without_command=True)

@@ -89,6 +89,6 @@ def points_per_steradian(points: float, fov_deg: tuple[float, float]) -> float:
 def points_on_target(area_m2: float, distance_m: float, points: float, fov_deg: tuple[float, float]) -> float:
     """Points of a frame that meet a surface that faces the lidar: its solid angle A / d² × the density.
 
-    An upper bound: a dark coat or rain send fewer back.
+    All of them at most. An upper bound too because a dark coat or rain send fewer back.
     """
-    return area_m2 / distance_m**2 * points_per_steradian(points, fov_deg)
+    return min(points, area_m2 / distance_m**2 * points_per_steradian(points, fov_deg))
