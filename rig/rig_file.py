@@ -65,12 +65,14 @@ class EncoderPart(_Part):
     tolerance: float = Field(
         default=20.0, ge=0, description="counts within which the calibration stays valid"
     )
+    motor: int = Field(default=0, ge=0, le=9, description="its motor's number at the microcontroller, or 0")
+    gpio: str = Field(default="", description="its chip and lines A, B (, index): gpiochip0 12 13")
 
 
 def _encoders() -> dict[str, EncoderPart]:
     return {
-        "zoom": EncoderPart(counts_per_turn=4741.44),
-        "focus": EncoderPart(counts_per_turn=4741.44),
+        "zoom": EncoderPart(counts_per_turn=4741.44, motor=1),
+        "focus": EncoderPart(counts_per_turn=4741.44, motor=2),
         "pan": EncoderPart(counts_per_turn=4000.0),
         "tilt": EncoderPart(counts_per_turn=4000.0),
     }
