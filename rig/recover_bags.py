@@ -175,6 +175,9 @@ class _Mcap(McapWalk):
         self.schema_bytes: dict[int, bytes] = {}
         self.channel_bytes: dict[int, bytes] = {}
         self.compression: str | None = None
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                losses.note("the first bytes of the file are damaged")
 
     def _define(self, op: int, content: bytes) -> None:
         super()._define(op, content)

@@ -89,12 +89,14 @@ def salvage_file(path: Path, target: Path | None, settings: Settings) -> Salvage
     kind = file_kind(path)
     if kind == "zstd":
         with unpacked(path, target.parent if target else None) as (inner, problem):
-            found = salvage_file(inner, target, settings)
-            return replace(
-                found,
-                whole=found.whole and not problem,
-                notes=(*([problem] if problem else []), *found.notes),
-            )
+            try:
+                found = salvage_file(inner, target, settings)
+            except InputError as error:
+                raise InputError(
+                    "Nothing can be saved of the compressed file.", file=path, found=problem or error.problem
+                ) from None
+            problems = (problem,) if problem else ()
+            return replace(found, whole=found.whole and not problem, notes=(*problems, *found.notes))
     if kind == "ros1":
         from acino_fte.rig.recover_bags import salvage_ros1
 

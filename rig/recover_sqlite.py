@@ -49,9 +49,11 @@ class _Rows(SqliteWalk):
     def _topics(self, connection: sqlite3.Connection) -> None:
         super()._topics(connection)
         known = {row[1] for row in connection.execute("PRAGMA table_info(topics)")}
-        if {"offered_qos_profiles", "type_description_hash"} <= known:
-            select = "SELECT id, offered_qos_profiles, type_description_hash FROM topics"
-            self.more = {row[0]: (str(row[1] or ""), str(row[2] or "")) for row in connection.execute(select)}
+        columns = [
+            name if name in known else "''" for name in ("offered_qos_profiles", "type_description_hash")
+        ]
+        select = f"SELECT id, {', '.join(columns)} FROM topics"  # noqa: S608 - two known names
+        self.more = {row[0]: (str(row[1] or ""), str(row[2] or "")) for row in connection.execute(select)}
 
     def _find_topics(self, pages: Pages) -> None:
         super()._find_topics(pages)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from acino_fte.data_tools.video import load_av
 from acino_fte.data_tools.video_cut import is_cut
@@ -40,10 +40,54 @@ def salvage_video(source: Path, target: Path | None) -> Salvaged:
         FFmpeg does not open the file.
     """
     av = load_av()
-    try:
-        container = av.open(str(source))
-    except (av.error.FFmpegError, ValueError, OSError) as error:
-        raise NoIndex(str(error)) from error
+    with source.open("rb") as file:
+        try:
+            container = av.open(_Part(file, _end(file)))
+        except (av.error.FFmpegError, ValueError) as error:
+            raise NoIndex(str(error)) from error
+        return _salvaged(av, container, source, target)
+
+
+class _Part:
+    """The first bytes of a file, as a file: FFmpeg opens no MP4 that ends in a head of pictures."""
+
+    def __init__(self, file: BinaryIO, end: int) -> None:
+        self._file, self._end = file, end
+        file.seek(0)
+
+    def read(self, n: int = -1) -> bytes:
+        """The next bytes, up to the end of the part."""
+        left = max(self._end - self._file.tell(), 0)
+        return self._file.read(left if n < 0 else min(n, left))
+
+    def seek(self, at: int, whence: int = 0) -> int:
+        """Go to a place."""
+        return self._file.seek(self._end + at, 0) if whence == 2 else self._file.seek(at, whence)
+
+    def tell(self) -> int:
+        """The place."""
+        return self._file.tell()
+
+
+def _end(file: BinaryIO) -> int:
+    """Where the last whole part of an MP4 ends, or its pictures, whole or not; the end of other files."""
+    size, at = file.seek(0, 2), 0
+    while at < size:
+        file.seek(at)
+        head = file.read(16)
+        kind, length = head[4:8], int.from_bytes(head[:4], "big")
+        length = int.from_bytes(head[8:], "big") if length == 1 else length
+        if not at and kind not in (b"ftyp", b"styp", b"moov", b"mdat", b"wide", b"free", b"skip"):
+            return size
+        if length == 0 or (at + length > size and kind == b"mdat"):
+            return size
+        if length < 8 or at + length > size:
+            return at or size
+        at += length
+    return size
+
+
+def _salvaged(av: Any, container: Any, source: Path, target: Path | None) -> Salvaged:
     with container:
         if not container.streams.video:
             raise InputError("The file has no pictures.", file=source, expected="a video stream")
