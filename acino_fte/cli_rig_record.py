@@ -31,7 +31,7 @@ def record(
     rig_file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[RIG.YAML]",
+            metavar="RIG.YAML",
             help="The rig. [dim]\\[default: rig.yaml here, else the rig of WildPose][/]",
             show_default=False,
         ),

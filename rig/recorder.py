@@ -64,23 +64,23 @@ class Recorder:
         self._notes, self._program, self._clock = tuple(notes), program, equipment.clock
         self._on_closing = closing
         self.log = EventLog()
-        self.reason = ""
-        self._stop, self._ended, self._lock = Flag(), Flag(), Lock()
+        self.reason = self.unwritten = ""
+        self._stop = False  # a plain value: a signal may come while any lock is held
+        self._ended, self._lock = Flag(), Lock()
         self._segments: dict[str, Segment] = {}
         self._open: list[OpenSegment] = []
         self._readers: list[Reader] = []
         self._images = self._next_tick = self._index = 0
         self._triggered_ns = 0
-        self._reason_lock = Lock()
         self._rates: tuple[float, dict[str, int], dict[str, float]] = (0.0, {}, {})
 
     # Beginning and end ------------------------------------------------------------
 
     def stop(self, reason: str = "asked to stop") -> None:
         """End the recording in good order; from any thread, or a signal."""
-        if not self._stop.is_set():
+        if not self._stop:
             self.reason = reason
-            self._stop.set()
+            self._stop = True
 
     def run(self, seconds: float | None = None, tell: Callable[[Status], None] | None = None) -> Manifest:
         """Record.
@@ -118,7 +118,13 @@ class Recorder:
     def _begin(self) -> None:
         self.log.add("started", self._stamper.started_ns)
         self._watches = {
-            stream.name: Watch(stream.name, self._expected_hz(stream), self.log, self._stamper.started_ns)
+            stream.name: Watch(
+                stream.name,
+                self._expected_hz(source, stream),
+                self.log,
+                self._stamper.started_ns,
+                self._on_demand(source, stream),
+            )
             for source in self._equipment.sources
             for stream in source.streams
         }
@@ -131,8 +137,12 @@ class Recorder:
             self._trigger()
         self._write("recording")
 
-    def _expected_hz(self, stream: SourceStream) -> float:
-        if self._every and stream.kind == "lidar" and self._rig.cameras:
+    def _on_demand(self, source: Source, stream: SourceStream) -> bool:
+        """Whether the recorder cuts the frames of a stream."""
+        return bool(self._every) and stream.kind == "lidar" and hasattr(source, "trigger")
+
+    def _expected_hz(self, source: Source, stream: SourceStream) -> float:
+        if self._every and self._on_demand(source, stream):
             return self._first_fps() / self._every
         return stream.expected_hz
 
@@ -198,7 +208,7 @@ class Recorder:
         start = clock.monotonic_ns()
         end = float("inf") if seconds is None else start + round(seconds * 1e9)
         tick = start
-        while not self._stop.is_set():
+        while not self._stop:
             reader = min(self._readers, key=Reader.due_ns)
             due = reader.due_ns()
             if min(due, tick) >= end:
@@ -216,11 +226,12 @@ class Recorder:
         threads = [ReaderThread(reader, self._ended, self._failed) for reader in self._readers]
         for thread in threads:
             thread.start()
-        while not self._stop.is_set():
+        while not self._stop:
             self._tick(tell)
             left = TICK_S if seconds is None else min(TICK_S, seconds - self._clock.elapsed_s)
-            if left <= 0 or self._stop.wait(left):
+            if left <= 0:
                 break
+            self._clock.wait(left)
         self._ended.set()
         for thread in threads:
             thread.join(timeout=2.0)
@@ -255,9 +266,10 @@ class Recorder:
     def _trigger(self) -> None:
         self._triggered_ns = self._stamper.log_ns()
         for source in self._equipment.sources:
-            trigger = getattr(source, "trigger", None)
-            if trigger is not None:
-                trigger()
+            for stream in source.streams:
+                if self._on_demand(source, stream):
+                    self._watches[stream.name].asked()
+                    source.trigger()  # type: ignore[attr-defined]
 
     def _free(self) -> int:
         return self._equipment.free_bytes(self.folder)
@@ -300,7 +312,7 @@ class Recorder:
         )
 
     def _disk_full(self, detail: str) -> None:
-        if not self._stop.is_set():
+        if not self._stop:
             self.log.add("disk_full", self._stamper.log_ns(), detail=detail)
             self.stop("the disk is full")
 
@@ -322,9 +334,8 @@ class Recorder:
         try:
             write_manifest(self.folder, manifest)
         except InputError as error:  # the one before is still there
-            if state == "closed":
-                raise
-            self.stop(f"the manifest cannot be written: {error.found}")
+            self.unwritten = f"the manifest cannot be written ({error.found})"
+            self.stop(self.unwritten)
         return manifest
 
     def manifest(self, state: State, ended_ns: int | None = None) -> Manifest:
@@ -342,7 +353,7 @@ class Recorder:
         for reader in self._readers:
             for stream in reader.source.streams:
                 name, written = stream.name, reader.writer.written
-                hz, received = self._expected_hz(stream), self._watches[name].received
+                hz, received = self._expected_hz(reader.source, stream), self._watches[name].received
                 drops = reader.dropped[name]
                 found.append(RecordedStream(name, stream.kind, hz, received, written.get(name, 0), drops))
                 if stream.kind == "image":

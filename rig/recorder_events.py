@@ -83,9 +83,15 @@ class Watch:
     log : EventLog
     started_ns : int
         Log time at which the stream is expected to begin.
+    on_demand : bool
+        Samples are asked for (:meth:`asked`): their times tell nothing of losses, how many came does.
     """
 
-    def __init__(self, stream: str, expected_hz: float, log: EventLog, started_ns: int) -> None:
+    def __init__(
+        self, stream: str, expected_hz: float, log: EventLog, started_ns: int, on_demand: bool = False
+    ) -> None:
+        self._on_demand = on_demand
+        self._owing = self._owed = self._told = 0  # samples that were asked for: now, at the last, told lost
         self.stream, self._log, self._lock = stream, log, RLock()
         self._period_ns = 1e9 / expected_hz
         self._limit_ns = max(STALL_PERIODS * self._period_ns, STALL_S * 1e9)
@@ -97,6 +103,11 @@ class Watch:
         self._lost = BundledEvent(log, "lost", stream, "the device's own numbers or times have gaps")
         self._twice = BundledEvent(log, "lost", stream, "numbers came twice; nothing is missing")
 
+    def asked(self) -> None:
+        """A sample was asked for."""
+        with self._lock:
+            self._owing += 1
+
     def received_at(self, log_ns: int, number: int | None, device_ns: int) -> None:
         """A sample came."""
         with self._lock:
@@ -106,12 +117,21 @@ class Watch:
                 self._begin("stall")
             if self._silence is not None:
                 self._end(log_ns, self._missing(number, device_ns, by_time=True))
-            elif (missing := self._missing(number, device_ns)) > 0:
-                begin = log_ns - round(missing * self._period_ns)
-                self._lost.add(begin, log_ns, missing)
+                self._owing = self._owed
+            elif (missing := self._deficit() if self._on_demand else self._missing(number, device_ns)) > 0:
+                end = log_ns - round(self._on_demand * self._period_ns)  # noticed a sample later
+                self._lost.add(end - round(missing * self._period_ns), end, missing)
             elif missing < 0:
                 self._twice.add(log_ns, log_ns, 0)
             self._last_ns, self._number, self._device_ns = log_ns, number, device_ns
+
+    def _deficit(self) -> int:
+        """Samples that were asked for and did not come; one that is late once is not missing."""
+        before, self._owing = self._owed, self._owing - 1
+        self._owed = self._owing
+        new = min(before, self._owed) - self._told
+        self._told += max(new, 0)
+        return max(new, 0)
 
     def _missing(self, number: int | None, device_ns: int, by_time: bool = False) -> int:
         """Samples between the last one and this; -1 where its number came before."""

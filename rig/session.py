@@ -28,8 +28,9 @@ from acino_fte.rig.recorder_types import Equipment, Status, expected_bytes_per_s
 from acino_fte.rig.rig_file import FILE_NAME, RigFile
 from acino_fte.rig.rig_read import rig_text
 from acino_fte.rig.simulated import SimulatedRig
-from acino_fte.rig.sources import DeviceGone, Source, real_sources
-from acino_fte.rig.writers_video import SOFTWARE, choose_codec
+from acino_fte.rig.sources import DeviceGone, Source, real_counts, real_sources
+from acino_fte.rig.writers_messages import prepare
+from acino_fte.rig.writers_video import RAW, SOFTWARE, choose_codec
 
 State = Literal["idle", "preflight", "recording", "closing"]
 _NEXT: dict[State, tuple[State, ...]] = {
@@ -112,6 +113,15 @@ class Session:
         self._asked_to_stop = ""
         if not rig.cameras and not rig.lidars:
             raise InputError("The rig has neither a camera nor a lidar.", key="cameras, lidars")
+        if self.options.lidar_every and not (
+            rig.cameras and any(hasattr(source, "trigger") for source in self.equipment.sources)
+        ):
+            raise InputError(
+                "Frames of the lidar cannot be cut by images.",
+                key="--lidar-every",
+                expected="a camera, and a lidar whose driver can",
+                remedy="leave it out: the lidar's own clock cuts them",
+            )
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise InputError(
                 "There is something already.",
@@ -123,7 +133,7 @@ class Session:
     def _equip(self) -> Equipment:
         if not self.options.simulate:
             sources = real_sources(self.rig)
-            return Equipment(sources, Clock())
+            return Equipment(sources, Clock(), real_counts(self.rig))
         rig = SimulatedRig(self.rig, self.options.faults, self.options.fast)
 
         def free(folder: Path) -> int:
@@ -153,11 +163,12 @@ class Session:
         """
         self._to("preflight")
         try:
+            prepare()
             made = not self.folder.exists()
             checks = [self._lock(), *self._room()]
             if made:
                 self._stack.callback(self._remove_empty)
-            checks += [*self._devices(), self._clock_set(), *self._codecs()]
+            checks += [*self._devices(), *self._encoders(), self._clock_set(), *self._codecs()]
         except BaseException:
             self._abandon()
             raise
@@ -250,6 +261,16 @@ class Session:
                 waiting.discard(sample.stream)
         return sorted(waiting)
 
+    def _encoders(self) -> list[Check]:
+        """Is there anything that reads them?"""
+        if not self.rig.encoders or not self.rig.cameras:
+            return []
+        names = ", ".join(self.rig.encoders)
+        if self.equipment.counts is not None:
+            return [Check("encoders", True, names)]
+        remedy = "docs/rig_devices.md says how a driver is made known"
+        return [Check("encoders", False, f"nothing reads {names}: images carry no counts", remedy)]
+
     def _clock_set(self) -> Check:
         now = self.equipment.clock.wall_ns() * 1e-9
         text = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(now))
@@ -260,9 +281,7 @@ class Session:
         checks = []
         for name, camera in self.rig.cameras.items():
             codec = self.equipment.codecs[name] = choose_codec(camera)
-            kind = {SOFTWARE: " (on the processor)", "rawvideo": " (every pixel kept)"}.get(
-                codec, " (hardware)"
-            )
+            kind = {SOFTWARE: " (on the processor)", RAW: " (every pixel kept)"}.get(codec, " (hardware)")
             checks.append(Check(f"video of {name}", True, codec + kind))
         return checks
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from math import ceil, inf
+from math import inf
 
 import numpy as np
 
@@ -35,7 +35,7 @@ class Timetable:
         self.stream = stream
         self._period = 1.0 / stream.expected_hz
         self._stalls = [f for f in faults if f.kind == "stall"]
-        self._lost = [(ceil(f.at_s / self._period - 1e-9), int(f.amount)) for f in faults if f.kind == "lost"]
+        self._losses = [[f.at_s, f.amount] for f in faults if f.kind == "lost"]  # from when on, how many left
         delays = np.random.default_rng(seed).exponential(_LATENCY_S, 997)
         self._delays = np.minimum(delays, _LATEST_S).tolist()
         self.start_ns = self.k = 0
@@ -65,16 +65,23 @@ class Timetable:
         """Leave out what the faults swallow."""
         while origin_ns is not None and self.nominal_ns() < inf:
             elapsed = (self.nominal_ns() - origin_ns) * 1e-9 + 1e-9
-            lost = any(first <= self.k < first + n for first, n in self._lost)
-            if not lost and not any(stall.covers(elapsed) for stall in self._stalls):
+            if not any(stall.covers(elapsed) for stall in self._stalls) and not self._loses(elapsed):
                 return
             self.next()
+
+    def _loses(self, elapsed: float) -> bool:
+        """Whether the next sample gets lost; it is counted."""
+        for loss in self._losses:
+            if loss[0] <= elapsed and loss[1] > 0:
+                loss[1] -= 1
+                return True
+        return False
 
 
 class SimulatedSource:
     """What simulated devices share: the timetables of their streams, and being unplugged.
 
-    ``delivered`` counts, by stream, what was read.
+    ``delivered`` counts, by stream, what was read since the recording began.
     """
 
     def __init__(
@@ -136,8 +143,8 @@ class SimulatedSource:
         if self._origin != self.clock.origin_ns:
             self._origin = self.clock.origin_ns
             for table in self._tables:
-                table.restart(self.clock.monotonic_ns())
-                self._first[table.stream.name] = 0
+                table.restart(self.clock.monotonic_ns() if self._origin is None else self._origin)
+                self._first[table.stream.name] = self.delivered[table.stream.name] = 0
         oldest = self.clock.monotonic_ns() - BUFFER_S * 1e9
         for table in self._tables:
             while table.nominal_ns() < oldest:
@@ -150,10 +157,10 @@ class SimulatedSource:
         wait_s = (due - self.clock.monotonic_ns()) * 1e-9
         if wait_s > 0:
             self.clock.wait(min(wait_s, timeout_s))
+            if wait_s > timeout_s and not self.gone:
+                return None
         if self.gone:
             raise DeviceGone(f"{self.name} is unplugged")
-        if wait_s > timeout_s:
-            return None
         self._settle()
         table = min(self._tables, key=Timetable.due_ns)
         nominal = table.nominal_ns()

@@ -16,7 +16,7 @@ from acino_fte.errors import InputError, did_you_mean
 from acino_fte.rig.rig_file import CameraPart, LidarPart, RigFile
 
 ENTRY_POINTS = "acino_fte.rig.devices"
-SIMULATED = "simulated"
+SIMULATED, ENCODERS = "simulated", "encoders"
 PLANNED = ("ximea", "livox")
 """Devices whose drivers are described, not written."""
 
@@ -109,9 +109,12 @@ class Counts(Protocol):
         """The newest counts, in the order of ``encoders:`` of ``rig.yaml``, without waiting."""
 
 
-Driver = Callable[[str, Any], Source]
+Driver = Callable[[str, Any], Any]
 DRIVERS: dict[str, Driver] = {}
-"""Drivers by name: called with the device's name and its part of ``rig.yaml``."""
+"""Drivers by name: called with the device's name and its part of ``rig.yaml``, they give a :class:`Source`.
+
+The one of the name ``encoders`` gives a :class:`Counts`.
+"""
 
 
 def register_driver(device: str, driver: Driver) -> None:
@@ -178,6 +181,18 @@ def real_sources(rig: RigFile) -> list[Source]:
             )
         found.append(find_driver(part.device, key)(name, part))
     return found
+
+
+def real_counts(rig: RigFile) -> Counts | None:
+    """What reads the encoders of a rig: the driver ``encoders``, where there is one."""
+    from importlib.metadata import entry_points
+
+    if not rig.encoders:
+        return None
+    if ENCODERS in DRIVERS:
+        return DRIVERS[ENCODERS](ENCODERS, rig.encoders)
+    found = [point for point in entry_points(group=ENTRY_POINTS) if point.name == ENCODERS]
+    return found[0].load()(ENCODERS, rig.encoders) if found else None
 
 
 def camera_topic(camera: str) -> str:

@@ -13,12 +13,13 @@ from typing import Any
 
 from acino_fte.data_tools.bags_serial import CDR, definitions, encode
 from acino_fte.data_tools.recording import ImuSamples, LidarReturns, PictureInfo
-from acino_fte.data_tools.ros_messages import DEFINITIONS, to_message
+from acino_fte.data_tools.ros_messages import DEFINITIONS, XIMEA_TYPE, to_message
 from acino_fte.rig.writers import missing_package
 
 CHUNK_BYTES = 8192
 """A chunk ends with the message that exceeds this; and four times a second, see `flush`."""
 _LIBRARY = "acino-fte"
+_TYPES = ("livox_ros_driver/msg/CustomMsg", "sensor_msgs/msg/Imu", XIMEA_TYPE)
 
 
 @lru_cache(maxsize=16)
@@ -33,6 +34,23 @@ def _definition(name: str) -> bytes:
         store.register(get_types_from_msg(text, known))
     text, _ = store.generate_msgdef(name, ros_version=2)
     return text.encode()
+
+
+def prepare() -> None:
+    """Load what writing needs, before it counts.
+
+    Raises
+    ------
+    InputError
+        A package is not installed.
+    """
+    try:
+        import mcap.writer  # noqa: F401
+    except ImportError as error:
+        raise missing_package("Recordings", error) from error
+    for name in _TYPES:
+        _definition(name)
+        definitions(name, "", 2)
 
 
 class MessageFile:
