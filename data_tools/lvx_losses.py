@@ -38,6 +38,8 @@ class StampLog:
         ns between two samples, of the device's type; None where that is not known: it is estimated then.
     held : bool
         Whether the last package taken waits for the next ones.
+    n : int
+        Packages with sound stamps.
     n_lost : int
         Packages missing between others.
     gaps : list of (first_ns, length_ns, count)
@@ -49,6 +51,7 @@ class StampLog:
     name: str
     step: float | None = None
     held: bool = False
+    n: int = 0
     n_lost: int = 0
     n_gaps: int = 0
     n_outliers: int = 0
@@ -83,6 +86,7 @@ class StampLog:
         self.held = not final and len(around) > 1 and abs(int(around[1]) - int(around[0])) > _OUTLIER_NS
         keep[len(keep) - self.held :] = False
         stamps, samples = stamps[keep], samples[keep]
+        self.n += int(keep[n_before:].sum())
         if self.first_ns is None and len(stamps):
             self.first_ns = int(stamps[0])
         self._learn(stamps, samples)
