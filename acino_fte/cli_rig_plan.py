@@ -127,29 +127,27 @@ def _init(path: Path | None, rig: RigFile) -> None:
 
 
 def _plan(rig: RigFile, file: Path | None, out: Path | None) -> None:
-    from acino_fte.result_files import check_output_folder
     from acino_fte.rig.plan import plan_rig
 
     result = plan_rig(rig)
-    target = None
-    if out is not None:
-        from acino_fte.rig.plan_files import CONTENTS
+    source = str(file) if file else "the rig of WildPose: there is no rig.yaml here"
+    if out is None:
+        _show(result, source)
+        return
+    from acino_fte.result_files import check_output_folder, written_whole
+    from acino_fte.rig.plan_files import CONTENTS, write_plan
 
-        target = check_output_folder(out, contents=CONTENTS)
-        if file is not None and file.resolve().parent == target:
-            raise InputError(
-                "The output folder holds the rig file that is read.",
-                file=target,
-                remedy="choose another folder with -o",
-            )
-    _show(result, str(file) if file else "the rig of WildPose: there is no rig.yaml here")
-    if target is not None:
-        from acino_fte.result_files import written_whole
-        from acino_fte.rig.plan_files import CONTENTS, write_plan
-
-        with written_whole(target, CONTENTS) as working:
-            write_plan(result, working)
-        stdout.print(f"\nwritten to {escape(str(target))}", soft_wrap=True)
+    target = check_output_folder(out, contents=CONTENTS)
+    if file is not None and file.resolve().parent == target:
+        raise InputError(
+            "The output folder holds the rig file that is read.",
+            file=target,
+            remedy="choose another folder with -o",
+        )
+    _show(result, source)
+    with written_whole(target, CONTENTS) as working:
+        write_plan(result, working)
+    stdout.print(f"written to {escape(str(target))}")
 
 
 def _show(result: RigPlan, source: str) -> None:

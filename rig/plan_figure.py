@@ -9,12 +9,13 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Rectangle
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from acino_fte.plots_style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, STYLE, margins, nothing
 from acino_fte.rig.plan import CameraPlan, RigPlan, animal_points
 from acino_fte.rig.plan_optics import depth_of_field_m, motion_blur_px, pixels_on_target
-from acino_fte.rig.plan_tables import hours, number, settings
+from acino_fte.rig.plan_tables import settings
+from acino_fte.rig.plan_text import hours, number, percent
 from acino_fte.rig.plan_verdicts import verdicts
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def plan_figure(plan: RigPlan, camera: str) -> Figure:
     one = next(item for item in plan.cameras if item.name == camera)
     figure = Figure(figsize=(_WIDTH, _HEIGHT))
     figure.subplots_adjust(top=1.0 - 0.95 / _HEIGHT)
-    margins(figure, 0.62, 0.25, 0.5, wspace=0.33, hspace=0.38)
+    margins(figure, 0.62, 0.25, 0.5, wspace=0.36, hspace=0.38)
     figure.text(0.012, 1 - 0.09 / _HEIGHT, f"Plan of {plan.rig.name}", va="top", fontsize=13)
     figure.text(0.012, 1 - 0.33 / _HEIGHT, settings(plan, camera), va="top", fontsize=8.5, color=GREY)
     _result(figure, plan)
@@ -121,7 +122,7 @@ def _fields(axes: Axes, plan: RigPlan, one: CameraPlan) -> None:
     for lidar in plan.lidars:
         axes.add_patch(Ellipse((0, 0), *lidar.field_m, facecolor=SKY, alpha=0.25, lw=0))
         axes.add_patch(Ellipse((0, 0), *lidar.field_m, fill=False, edgecolor=SKY, lw=1.2))
-        axes.text(0, 0.43 * lidar.field_m[1], lidar.name, ha="center", va="top", fontsize=8, color=BLUE)
+        axes.text(0, 0.5 * lidar.field_m[1], lidar.name, ha="center", va="bottom", fontsize=8, color=BLUE)
         reach = [max(old, 0.5 * new) for old, new in zip(reach, lidar.field_m, strict=True)]
     low, high = part.lens.focal_mm
     for both in [both for both in plan.overlaps if both.camera == one.name][:1]:
@@ -148,7 +149,7 @@ def _fields(axes: Axes, plan: RigPlan, one: CameraPlan) -> None:
     _equal(axes, 1.1 * reach[0], 1.15 * reach[1])
     axes.set(xlabel=f"m at {wishes.distance_m:g} m (the animal is black)")
     seen = [both for both in plan.overlaps if both.camera == one.name]
-    share = f": {100 * seen[0].of_lidar:.2g} % of the lidar's field" if seen else ""
+    share = f": {percent(seen[0].of_lidar)} of the lidar's field" if seen else ""
     axes.set_title(f"In the picture{share}", loc="left")
 
 
@@ -219,7 +220,7 @@ def _points(axes: Axes, plan: RigPlan, one: CameraPlan) -> None:
     for name, colour in zip(plan.rig.lidars, (BLUE, ORANGE, GREEN, PURPLE) * len(plan.lidars), strict=False):
         values = [animal_points(plan.rig.lidars[name], wishes, d) for d in distance]
         axes.plot(distance, values, color=colour)
-        axes.text(distance[0], values[0], f"  {name}", va="center", fontsize=8, color=colour)
+        axes.text(distance[0], values[0], f" {name}", va="bottom", fontsize=8, color=colour)
     axes.axhline(wishes.lidar_points, color=RED, lw=1.2, ls="--")
     axes.text(
         distance[0],
@@ -232,7 +233,7 @@ def _points(axes: Axes, plan: RigPlan, one: CameraPlan) -> None:
     for lidar in plan.lidars:
         axes.plot(wishes.distance_m, lidar.points, "ko", ms=6)
         axes.annotate(
-            f"{lidar.points:.3g}",
+            number(lidar.points, 3),
             (wishes.distance_m, lidar.points),
             xytext=(6, 4),
             textcoords="offset points",
@@ -269,5 +270,4 @@ def _logarithmic(axes: Axes, axis: str) -> None:
     low, high = getattr(axes, f"get_{axis}lim")()
     one.set_major_locator(LogLocator(subs=(1.0,) if high > 2000 * low else (1.0, 2.0, 5.0)))
     one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    one.set_minor_formatter(NullFormatter())
-    one.set_minor_locator(LogLocator(subs=range(2, 10)))
+    one.set_minor_locator(NullLocator())

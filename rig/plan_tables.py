@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from acino_fte.rig.plan import RigPlan
 from acino_fte.rig.plan_storage import StorageRow
+from acino_fte.rig.plan_text import hours, number, percent, seconds, sharp, short
 from acino_fte.rig.plan_verdicts import Verdict, verdicts
 
 _NAMES = {"raw": "raw", "h264": "H.264", "none": "none", "single": "single", "dual": "dual"}
@@ -84,8 +85,8 @@ def _storage_row(row: StorageRow) -> tuple[str, ...]:
     return (
         _NAMES.get(row.video, row.video),
         _NAMES.get(row.lidar, row.lidar),
-        number(row.mbit_s, 4),
-        number(row.mb_s, 4),
+        short(row.mbit_s, 4),
+        short(row.mb_s, 4),
         number(row.gb_per_hour, 3),
         hours(row.fills_h),
         hours(row.hours),
@@ -261,37 +262,3 @@ def _cell(value: object) -> object:
 
 def _escaped(text: str) -> str:
     return "".join(_MARKDOWN.get(c, c) for c in text)
-
-
-def number(value: float, digits: int) -> str:
-    """So many digits, never as a power of ten; ∞ for infinite ones."""
-    if not math.isfinite(value):
-        return "∞" if value > 0 else "—"
-    if value == 0:
-        return "0"
-    places = digits - 1 - math.floor(math.log10(abs(value)))
-    return f"{round(value, places):.{max(places, 0)}f}"
-
-
-def hours(value: float) -> str:
-    """Hours, or minutes below one."""
-    return f"{number(value, 2 if value < 10 else 3)} h" if value >= 1.0 else f"{number(60 * value, 2)} min"
-
-
-def seconds(value: float) -> str:
-    """Seconds, or minutes and hours where they are many."""
-    if value < 180:
-        return f"{number(value, 3)} s"
-    return f"{number(value / 60, 3)} min" if value < 10_800 else hours(value / 3600)
-
-
-def percent(share: float) -> str:
-    """A share in percent; only the whole is 100 %."""
-    if share > 1 - 1e-9:
-        return "100 %"
-    return f"{min(100 * share, 99.9):.3g} %"
-
-
-def sharp(near_m: float, far_m: float) -> str:
-    """From … to …, with ∞."""
-    return f"{number(near_m, 3)}–{number(far_m, 3)} m" if math.isfinite(far_m) else f"{number(near_m, 3)} m–∞"

@@ -10,6 +10,7 @@ from typing import Literal
 from acino_fte.rig.plan import CameraPlan, RigPlan, coarsest_step_cm
 from acino_fte.rig.plan_encoders import counts_for_step, turns_the_lens
 from acino_fte.rig.plan_optics import depth_of_field_m
+from acino_fte.rig.plan_text import at_least, at_most, number, sharp, short
 from acino_fte.rig.rig_file import CameraPart
 
 TIGHT = 1.2
@@ -73,26 +74,6 @@ def _verdict(
     )
 
 
-def at_least(value: float) -> str:
-    """Three digits, rounded up, for what must not be less."""
-    return _rounded(value, up=True)
-
-
-def at_most(value: float) -> str:
-    """Three digits, rounded down, for what must not be more."""
-    return _rounded(value, up=False)
-
-
-def _rounded(value: float, up: bool) -> str:
-    if not math.isfinite(value) or value == 0:
-        return f"{value:g}"
-    step = 10.0 ** (math.floor(math.log10(abs(value))) - 2)
-    steps = value / step
-    if abs(steps - round(steps)) > 1e-6:  # else it has three digits already
-        steps = math.ceil(steps) if up else math.floor(steps)
-    return f"{round(steps) * step:.10g}"
-
-
 def _without_loss(plan: RigPlan) -> Verdict:
     """FR1. The camera can take images that fast, disk and memory can take the bytes, and there is room."""
     rig, row = plan.rig, plan.storage.planned
@@ -105,7 +86,6 @@ def _without_loss(plan: RigPlan) -> Verdict:
         "disk": 1.0 / row.disk_share if row.disk_share <= 1.0 else length,
         "room": row.hours * 60.0 / minutes,
     }
-    worst = min(margins, key=lambda name: margins[name])
     size = at_least(row.gb_per_hour * minutes / 60.0 + rig.storage.reserve_gb)
     remedies = {
         "images": _slower(camera, slowest.highest_fps),
@@ -116,10 +96,10 @@ def _without_loss(plan: RigPlan) -> Verdict:
         "FR1",
         "",
         f"{minutes:g} min without loss",
-        f"{camera.fps:.4g} fps, {row.mb_s:.3g} MB/s",
-        f"{slowest.highest_fps:.3g} fps, {rig.storage.write_mb_s:.4g} MB/s",
-        margins[worst],
-        remedies[worst],
+        f"{short(camera.fps)} fps, {short(row.mb_s)} MB/s",
+        f"{number(slowest.highest_fps, 3)} fps, {short(rig.storage.write_mb_s)} MB/s",
+        min(margins.values()),
+        "; ".join(remedies[name] for name, margin in margins.items() if margin < _ENOUGH),
         "computed; confirm it on the rig with acino-fte rig record, then acino-fte rig check",
     )
 
@@ -146,12 +126,14 @@ def _footage(plan: RigPlan) -> Verdict:
         rate = f"{at_most(storage.most_mbit_s)} Mbit/s"
         together = " together" if len(rig.cameras) > 1 else ""
         remedy = f"record with codec: h264 and at most {rate} of video{together}, or {remedy}"
+    elif any(camera.codec == "raw" for camera in rig.cameras.values()):
+        remedy += ", or less with codec: h264"
     return _verdict(
         "FR2",
         "",
         f"{hours:g} h of footage",
-        f"{row.gb_per_hour * hours:.4g} GB",
-        f"{rig.storage.capacity_gb:g} GB: {row.hours:.3g} h",
+        f"{number(row.gb_per_hour * hours, 3)} GB",
+        f"{rig.storage.capacity_gb:g} GB: {number(row.hours, 3)} h",
         row.hours / hours,
         remedy,
     )
@@ -165,16 +147,16 @@ def _pixels(plan: RigPlan, camera: CameraPlan) -> Verdict:
     if camera.least_focal_mm <= longest:
         remedy = f"zoom to at least {at_least(camera.least_focal_mm)} mm"
     else:
+        zoomed = f" with {longest:g} mm" if camera.focal_mm < longest else ""
         remedy = (
-            f"take a lens of {at_least(camera.least_focal_mm)} mm, "
-            f"or zoom to {longest:g} mm and go within {at_most(nearer)} m"
+            f"take a lens of {at_least(camera.least_focal_mm)} mm, or go within {at_most(nearer)} m{zoomed}"
         )
     return _verdict(
         "FR3",
         _only(plan, camera),
         f"{wishes.least_px:g} px at {wishes.distance_m:g} m",
         f"f ≥ {camera.least_focal_mm:.2f} mm",
-        f"{camera.focal_mm:.4g} mm: {camera.pixels:.4g} px",
+        f"{camera.focal_mm:.4g} mm: {number(camera.pixels, 3)} px",
         camera.pixels / wishes.least_px,
         remedy,
     )
@@ -189,7 +171,8 @@ def _rings(plan: RigPlan, camera: CameraPlan) -> Verdict:
     rings = [one for one in plan.encoders if turns_the_lens(one.name)]
     what = "zoom and refocus" if zooms else "refocus"
     if missing:
-        text = f"put an encoder on the {' and the '.join(missing)} ring, and '{missing[0]}' under encoders"
+        names = " and ".join(missing)
+        text = f"put encoders on the {names} ring, and {names} under encoders in the rig file"
         return Verdict("FR4", _only(plan, camera), what, "ring encoders", "none", None, "fail", text)
     steps = max(one.step_deg for one in rings)
     loose = max(one.tolerance_deg for one in rings)
@@ -245,7 +228,7 @@ def _fits(plan: RigPlan, camera: CameraPlan) -> Verdict:
         _only(plan, camera),
         "whole animal in view",
         f"{part.width} × {part.height} px",
-        f"{camera.pixels:.4g} × {camera.pixels_high:.4g} px",
+        f"{number(camera.pixels, 3)} × {number(camera.pixels_high, 3)} px",
         min(part.width / camera.pixels, part.height / camera.pixels_high),
         remedy,
     )
@@ -260,8 +243,8 @@ def _sharp(plan: RigPlan, camera: CameraPlan) -> Verdict:
         _only(plan, camera),
         f"sharp to {wishes.sharp_px:g} px",
         f"{max(distance - half, 0):.4g}–{distance + half:.4g} m",
-        f"{camera.near_m:.3g}–{camera.far_m:.3g} m".replace("inf m", "∞"),
-        min(distance - camera.near_m, camera.far_m - distance) / half,
+        sharp(camera.near_m, camera.far_m),
+        max(0.0, min(distance - camera.near_m, camera.far_m - distance) / half),
         _sharper(plan, camera),
     )
 
@@ -288,7 +271,7 @@ def _blur(plan: RigPlan, camera: CameraPlan) -> Verdict:
         _only(plan, camera),
         f"motion blur, {wishes.speed_m_s:g} m/s",
         f"≤ {wishes.blur_px:g} px",
-        f"{camera.blur_px:.3g} px, {part.exposure_us:g} µs",
+        f"{number(camera.blur_px, 3)} px, {part.exposure_us:g} µs",
         wishes.blur_px / camera.blur_px if camera.blur_px else math.inf,
         f"set exposure_us to at most {at_most(camera.most_exposure_us)}, zoom out, or follow the animal",
         "of a camera that stands still; following the animal leaves less",
@@ -305,7 +288,7 @@ def _lidar_points(plan: RigPlan) -> Iterator[Verdict]:
             lidar.name if len(plan.lidars) > 1 else "",
             "lidar points on it",
             f"≥ {wishes.lidar_points:g}",
-            f"{lidar.points:.3g} a frame",
+            f"{number(lidar.points, 3)} a frame",
             margin,
             f"go within {at_most(wishes.distance_m * math.sqrt(margin))} m, or put {frames} frames together",
             "if every point comes back",
@@ -323,9 +306,9 @@ def _head(plan: RigPlan) -> Iterator[Verdict]:
         "",
         "pan and tilt, a step",
         f"≤ {wishes.pan_cm:g} cm",
-        f"{step:.3g} cm",
+        f"{number(step, 3)} cm",
         wishes.pan_cm / step,
-        f"take an encoder of at least {math.ceil(counts)} counts a turn ({math.ceil(counts / 4)} pulses × 4)",
+        f"take encoders of at least {math.ceil(counts)} counts a turn ({math.ceil(counts / 4)} pulses × 4)",
     )
 
 
