@@ -58,7 +58,7 @@ def plan(
     ] = None,
     focus: Annotated[float | None, _change("Distance in focus, m.", "M")] = None,
     f_number: Annotated[float | None, _change("Aperture: 4 is f/4.", "N")] = None,
-    exposure: Annotated[float | None, _change("Exposure, µs.", "µS")] = None,
+    exposure: Annotated[float | None, _change("Exposure, µs.", "µs")] = None,
     fps: Annotated[float | None, _change("Images a second.", "HZ")] = None,
     codec: Annotated[_Codec | None, _change("Of the video.")] = None,
     bitrate: Annotated[float | None, _change("Of H.264 video, Mbit/s.", "MBIT")] = None,
@@ -134,10 +134,11 @@ def _plan(rig: RigFile, file: Path | None, out: Path | None) -> None:
     if out is None:
         _show(result, source)
         return
-    from acino_fte.result_files import check_output_folder, written_whole
-    from acino_fte.rig.plan_files import CONTENTS, write_plan
+    from acino_fte.result_files import Contents, check_output_folder, written_whole
+    from acino_fte.rig.plan_files import FILES, write_plan
 
-    target = check_output_folder(out, contents=CONTENTS)
+    contents = Contents("plan of a rig", FILES, ("plan.json", "plan.md"))
+    target = check_output_folder(out, contents=contents)
     if file is not None and file.resolve().parent == target:
         raise InputError(
             "The output folder holds the rig file that is read.",
@@ -145,8 +146,16 @@ def _plan(rig: RigFile, file: Path | None, out: Path | None) -> None:
             remedy="choose another folder with -o",
         )
     _show(result, source)
-    with written_whole(target, CONTENTS) as working:
-        write_plan(result, working)
+    try:
+        with written_whole(target, contents) as working:
+            write_plan(result, working)
+    except OSError as error:
+        raise InputError(
+            "The folder cannot be written; what was there before is still there.",
+            file=target,
+            found=error.strerror or str(error),
+            remedy="free some space, or choose another folder with -o",
+        ) from None
     stdout.print(f"written to {escape(str(target))}")
 
 

@@ -8,21 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from acino_fte.data_tools.whole_text import write_text_whole
-from acino_fte.result_files import Contents
 from acino_fte.rig.plan import RigPlan
 from acino_fte.rig.plan_tables import csv_tables, plan_markdown
 from acino_fte.rig.plan_verdicts import verdicts
 from acino_fte.rig.rig_file import FILE_NAME
 from acino_fte.rig.rig_read import write_rig
 
-CONTENTS = Contents(
-    "plan of a rig",
-    (
-        *("plan.json", "plan.md", "requirements.csv", "storage.csv", "pixels.csv", "distances.csv"),
-        *(FILE_NAME, "figures"),
-    ),
-    ("plan.json", "plan.md"),
+FILES = (
+    *("plan.json", "plan.md", "requirements.csv", "storage.csv", "pixels.csv", "distances.csv"),
+    *(FILE_NAME, "figures"),
 )
+"""What a plan's folder holds."""
 
 
 def plan_json(plan: RigPlan) -> dict[str, Any]:

@@ -63,12 +63,13 @@ def read_rig(path: Path | str) -> RigFile:
     path = find_rig_file(Path(path)) or Path(path)
     data = read_yaml(path)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
+        kind = "nothing" if data is None else type(data).__name__
         raise InputError(
             "This is not a rig file of a format that this version reads.",
             file=path,
             key="format",
             expected=FORMAT,
-            found=repr(data.get("format")) if isinstance(data, dict) else type(data).__name__,
+            found=repr(data.get("format")) if isinstance(data, dict) else kind,
             remedy=f"write 'format: {FORMAT}' as its first line; acino-fte rig plan --init writes a new file",
         )
     return checked_rig(data, path)

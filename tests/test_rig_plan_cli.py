@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from acino_fte.cli_rig import app
 from acino_fte.rig.plan import plan_rig
 from acino_fte.rig.plan_changes import PlanChanges, changed_rig
-from acino_fte.rig.plan_files import CONTENTS, plan_json
+from acino_fte.rig.plan_files import FILES, plan_json
 from acino_fte.rig.plan_tables import plan_markdown, verdict_table
 from acino_fte.rig.plan_text import at_least, at_most, number
 from acino_fte.rig.plan_verdicts import verdicts
@@ -66,7 +66,7 @@ def test_the_page_shows_every_figure_that_its_commands_print(page):
 def test_the_folder_holds_what_the_page_says(page):
     folder, _ = page
     out = folder / "plan"
-    assert {path.name for path in out.iterdir()} == set(CONTENTS.files)
+    assert {path.name for path in out.iterdir()} == set(FILES)
     figures = {path.name: path.read_bytes() for path in (out / "figures").iterdir()}
     assert {name: data[:4] for name, data in figures.items()} == {"cam1.png": b"\x89PNG", "cam1.pdf": b"%PDF"}
     assert read_rig(out).cameras["cam1"].lens.used_mm == 75
@@ -92,6 +92,15 @@ def test_a_plan_is_replaced_by_a_plan_and_nothing_else_is(page, tmp_path, monkey
     before = (folder / "plan" / "plan.json").read_text(encoding="utf-8")
     run(folder, "--focal", "20", "-o", "plan")
     assert (folder / "plan" / "plan.json").read_text(encoding="utf-8") != before
+
+    def full(plan, out):
+        raise OSError(28, "No space left on device")
+
+    before = (folder / "plan" / "plan.json").read_text(encoding="utf-8")
+    monkeypatch.setattr("acino_fte.rig.plan_figure.save_plan_figures", full)
+    assert "No space left" in run(folder, "-o", "plan", code=2)
+    assert (folder / "plan" / "plan.json").read_text(encoding="utf-8") == before
+    assert sorted(path.name for path in folder.iterdir()) == ["plan", "rig.yaml"]
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "diary.txt").write_text("cheetah!")
     said = run(tmp_path, "-o", "mine", code=2)

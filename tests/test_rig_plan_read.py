@@ -54,7 +54,7 @@ def test_what_is_left_out_has_its_default(tmp_path):
     [
         ("name: rig\n", ["format: acino-fte/rig/1"]),
         ("- a\n- b\n", ["found:    list", "--init"]),
-        ("", ["found:    NoneType"]),
+        ("", ["found:    nothing"]),
         (HEAD + "storge: {ram_gb: 16}\n", ["did you mean 'storage'?"]),
         (HEAD + "cameras: {cam1: {lens: {f_numbr: 4}}}\n", ["cameras.cam1.lens", "did you mean 'f_number'?"]),
         (HEAD + "cameras: {cam1: {fps: fast}}\n", ["cameras.cam1.fps", "fast"]),
