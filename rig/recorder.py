@@ -269,7 +269,7 @@ class Recorder:
             for stream in source.streams:
                 if self._on_demand(source, stream):
                     self._watches[stream.name].asked()
-                    source.trigger()  # type: ignore[attr-defined]
+                    source.trigger()
 
     def _free(self) -> int:
         return self._equipment.free_bytes(self.folder)
