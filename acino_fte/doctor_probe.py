@@ -14,15 +14,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-HARDWARE_H264 = (  # NVIDIA, the Linux kernel (Raspberry Pi), Intel twice, AMD, Apple, Windows
-    "h264_nvenc",
-    "h264_v4l2m2m",
-    "h264_vaapi",
-    "h264_qsv",
-    "h264_amf",
-    "h264_videotoolbox",
-    "h264_mf",
-)
+HARDWARE_H264 = ("h264_nvenc", "h264_v4l2m2m", "h264_vaapi", "h264_videotoolbox")
+"""Those that the rig's recorder takes, the best first: NVIDIA, the Linux kernel, Intel and AMD, Apple."""
 _HS71 = (1.0, 4.7429994, 3.8211503, 1.3794082)  # its solution: Hock & Schittkowski 1981, problem 71
 _SIZE = (320, 240)  # px, of the pictures that encoders are tried with; hardware refuses very small ones
 

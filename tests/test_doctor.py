@@ -49,7 +49,10 @@ def look(
 ) -> Finding:
     """What a check finds, with a root of its own and the answers of a healthy computer elsewhere."""
     check = next(check for check in all_checks() if check.name == name)
-    return looked(check, Surroundings(path or tmp_path, tmp_path, WELL | (answers or {})))
+    finding = looked(check, Surroundings(path or tmp_path, tmp_path, WELL | (answers or {})))
+    assert finding.remedy or finding.state == "ok", finding
+    assert "\n" not in finding.found + finding.remedy
+    return finding
 
 
 @pytest.fixture
@@ -381,6 +384,13 @@ def test_encoders_that_fail(tmp_path, monkeypatch):
     monkeypatch.setattr(doctor_probe, "_encode", lambda name: [])
     pytest.importorskip("av")
     assert "libx264" in doctor_probe.probe("codecs")["faults"]  # pictures that cannot be read again
+
+
+def test_the_encoders_tried_are_those_that_the_recorder_takes():
+    from acino_fte.rig.writers_video import HARDWARE, SOFTWARE
+
+    assert doctor_probe.HARDWARE_H264 == HARDWARE
+    assert SOFTWARE == "libx264"
 
 
 def test_local_pages(tmp_path, monkeypatch):
