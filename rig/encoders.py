@@ -19,8 +19,11 @@ WINDOW_NS = 100_000_000
 """Of the velocity."""
 REST_NS = 500_000_000
 """Without a count for this long, the shaft is at rest."""
-SAME_COUNTS = 50
-"""A counter that went on from where it was after an interruption is within this of it."""
+RUN_ON, FROM_ZERO = 1500, 5
+"""A counter that went on through an interruption is within the first of where it was: the motor ran on until
+its dead-man. One within the second of 0 has started again, unless it was there before."""
+_NEAR, _FASTEST = 500, 20_000.0
+"""Counts, and counts a second, by which reports can differ."""
 
 
 class CountSource(Protocol):
@@ -75,17 +78,47 @@ class LineCounts:
 
 
 class ReportedCounts:
-    """Counts that a microcontroller reports; whoever reads its messages puts them here."""
+    """Counts that a microcontroller reports; whoever reads its messages puts them here.
+
+    A report that the motor cannot have reached is left out and counted as a glitch. If the next one agrees
+    with it, the counter has started again (`restarted`), as after a loss of power.
+    """
 
     index_position = None
 
     def __init__(self) -> None:
         self.counts: int | None = None
         self.glitches = Glitches()
+        self.restarted = False
+        self._when_ns = 0
+        self._odd: int | None = None
 
     def poll(self) -> int | None:
         """The last report."""
         return self.counts
+
+    def put(self, counts: int, now_ns: int) -> None:
+        """A report.
+
+        Parameters
+        ----------
+        counts : int
+            As the microcontroller said.
+        now_ns : int
+            By the clock of the loop.
+        """
+        near = _NEAR + _FASTEST * (now_ns - self._when_ns) * 1e-9
+        if self.counts is not None and abs(counts - self.counts) > near:
+            if self._odd is None or abs(counts - self._odd) > near:
+                self._odd = counts
+                self.glitches += Glitches(illegal=1)
+                return
+            self.restarted = True
+        self.counts, self._when_ns, self._odd = counts, now_ns, None
+
+    def forget(self) -> None:
+        """The microcontroller is gone: nothing is known until it reports again."""
+        self.counts, self._odd, self.restarted = None, None, False
 
 
 @dataclass(frozen=True)
@@ -215,9 +248,12 @@ class Encoder:
 
     def _take_up(self, raw: int) -> None:
         """After an interruption: the counter went on, or began again where the shaft stood."""
-        last = self.counts if self.counts is not None else self._last_known
-        if self._offset is not None and abs(raw + self._offset - last) > SAME_COUNTS:
-            self._offset, self.sure = last - raw, False
+        if self._offset is None or self.counts is None:
+            return
+        before = self.counts - self._offset
+        started_again = abs(raw) <= FROM_ZERO < abs(before)
+        if started_again or abs(raw - before) > RUN_ON:
+            self._offset, self.sure = self.counts - raw, False
 
     def _use_index(self) -> None:
         """The index pulse, where there is one, corrects lost counts; the first one gives the angle again."""

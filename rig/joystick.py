@@ -238,3 +238,18 @@ def sampled(adc: Adc, n: int, wait: Callable[[], None]) -> list[tuple[int, ...]]
         readings.append(adc.read())
         wait()
     return readings
+
+
+def simulated_sweep() -> Adc:
+    """A converter whose stick rests for 100 readings, and then is moved round along all its ends."""
+
+    class Sweep:
+        def __init__(self) -> None:
+            self.n = 0
+
+        def read(self) -> tuple[int, ...]:
+            self.n += 1
+            out, turn = (0.0 if self.n <= 100 else 450.0), self.n * 0.05
+            return round(510 + out * math.cos(turn)), round(505 + out * math.sin(turn))
+
+    return Sweep()

@@ -97,9 +97,17 @@ def test_a_counter_that_begins_again_does_not_move_the_shaft():
     encoder.poll(1)
     assert (encoder.counts, encoder.sure) == (3004, True)
     encoder.interrupted()
-    source.counts = 2  # it had no power
+    source.counts = 4100  # and the motor ran on until its dead-man
     encoder.poll(2)
-    assert (encoder.counts, encoder.sure) == (3004, False)
+    assert (encoder.counts, encoder.sure) == (4100, True)
+    for before, after in ((4100, 2), (300, 0), (300, 9000)):  # it had no power
+        source.counts = before
+        encoder.poll(3)
+        encoder.zero(before)
+        encoder.interrupted()
+        source.counts = after
+        encoder.poll(4)
+        assert (encoder.counts, encoder.sure) == (before, False)
 
 
 def test_the_index_finds_the_angle_again_and_counts_what_was_lost(tmp_path):
