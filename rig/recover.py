@@ -16,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from secrets import token_hex
 
+from acino_fte.data_tools.video import VIDEO_SUFFIXES
 from acino_fte.data_tools.whole_text import write_text_whole
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.rig.recover_files import (
@@ -31,6 +32,7 @@ from acino_fte.rig.recover_types import Recovery, Salvaged
 REPORT = "recovery.json"
 _TAIL = "-recovered"
 _BAG2 = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+_OTHERS = (".bag", ".lvx", ".lvx2", ".hdf5", *VIDEO_SUFFIXES)
 _NUMBERED = re.compile(r"(.+)_(\d+)\.(db3|mcap)(\.zstd)?")
 _EXPECTED = (
     "a bag of ROS 1 or ROS 2, an MCAP, an LVX, eCAL's .hdf5, an MP4 or Matroska video, the folder of a "
@@ -120,8 +122,9 @@ def _kind(source: Path) -> str:
     if looks_recorded(source):
         return "rig"
     bags = [name for name in names if name.endswith(_BAG2)]
-    stems = {match[1] if (match := _NUMBERED.fullmatch(name)) else name for name in bags}
-    if bags and ("metadata.yaml" in names or len(stems) == 1):
+    stems = {match[1] if (match := _NUMBERED.fullmatch(name)) else None for name in bags}
+    others = any(name.lower().endswith(_OTHERS) for name in names)
+    if bags and ("metadata.yaml" in names or (len(stems) == 1 and None not in stems and not others)):
         return "bag2"
     return "batch"
 

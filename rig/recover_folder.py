@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
-import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import gettempdir
 
 from acino_fte.data_tools.rig_reader import is_rig_folder
 from acino_fte.data_tools.rig_recording import (
@@ -24,7 +27,6 @@ from acino_fte.rig.recover_types import Salvaged, SavedStream, merged
 
 _MESSAGES = re.compile(r"messages-(\d+)\.mcap")
 _VIDEO = re.compile(r"(.+)-(\d+)\.(mkv|mp4|avi)")
-_RECENT_S = 10.0  # a file that was written so lately may still be under way
 _INFO = "/info"
 
 
@@ -84,10 +86,9 @@ def salvage_recorded(source: Path, target: Path | None, settings: Settings) -> S
         folder.wrong(f"{error.problem} It was made again from the files beside it.")
     if folder.before is not None and folder.before.state == "recording":
         folder.wrong("The recording was not closed: its recorder was stopped by force, or lost its power.")
-        newest = max((file.stat().st_mtime for file in source.iterdir()), default=0.0)
-        if 0 <= time.time() - newest < _RECENT_S:
+        if (process := _recorder(source)) is not None:
             folder.notes.append(
-                "Its files changed a moment ago: if the recorder still runs, stop it and rescue again."
+                f"Its recorder still runs (process {process}): stop it with Ctrl-C, and rescue again."
             )
     for path in sorted(source.iterdir()):
         _file(folder, path, target, settings)
@@ -104,6 +105,18 @@ def salvage_recorded(source: Path, target: Path | None, settings: Settings) -> S
         sum(part.found.bytes_lost for part in folder.parts),
         tuple(folder.notes),
     )
+
+
+def _recorder(source: Path) -> int | None:
+    """The process that records into a folder, by the lock of the rig beside it."""
+    places = (source.resolve().parent, Path(gettempdir()))
+    for lock in (lock for place in places for lock in place.glob("acino-fte-rig-*.lock")):
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            content = json.loads(lock.read_text("utf-8"))
+            if Path(content["recording"]) == source.resolve():
+                os.kill(int(content["pid"]), 0)  # an OSError where there is no such process
+                return int(content["pid"])
+    return None
 
 
 def _file(folder: _Folder, path: Path, target: Path | None, settings: Settings) -> None:

@@ -268,7 +268,7 @@ def _sum(same: list[SavedStream]) -> SavedStream:
         same[0].name,
         next((s.type for s in same if s.type), ""),
         sum(s.saved for s in same),
-        sum(s.seconds for s in same),
+        (max(lasts) - min(firsts)) / 1e9 if firsts and lasts else 0.0,
         min(firsts, default=None),
         max(lasts, default=None),
         sum(s.lost for s in same),
