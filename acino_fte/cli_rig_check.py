@@ -119,13 +119,15 @@ def _show(found: Check, quiet: bool) -> None:
             grid.add_row(*(escape(text) for text in stream_row(stream)))
         stdout.print(grid)
         stdout.print()
-    for one in sorted(bad, key=lambda one: one.verdict != "fail"):
+    bad.sort(key=lambda one: one.verdict != "fail")
+    for i, one in enumerate(bad):
         colour = _COLOURS[one.verdict]
         stdout.print(
             f"[bold {colour}]{_MARKS[one.verdict]} {escape(one.name)}[/] {escape(one.subject)}: "
             f"{escape(one.found)} [dim](limit: {escape(one.limit)})[/]"
         )
-        if one.remedy:
+        again = i + 1 < len(bad) and bad[i + 1].remedy == one.remedy
+        if one.remedy and not again:
             stdout.print(f"    {escape(one.remedy)}")
     wrong = {one.name for one in bad}
     good = list(dict.fromkeys(one.name for one in found.requirements if one.name not in wrong))

@@ -82,11 +82,9 @@ class CameraCheck:
         for i, place in np.argwhere(glitch).tolist():
             if self._old <= i + 1 < stop:
                 self._glitch(rows[i + 1][0], place, int(counts[i + 1, place] - counts[i, place]))
-        odd = np.zeros(counts.shape, bool)
-        odd[1:] |= glitch
         for place, _, tolerance in self._lens:
             if place < width:
-                self._follow(rows, counts[:, place], odd[:, place], place, tolerance, (self._old, stop))
+                self._follow(rows, _without_spikes(counts[:, place]), place, tolerance, (self._old, stop))
         self._rows = rows[stop - _AROUND :]
         self._old = _AROUND
 
@@ -98,28 +96,32 @@ class CameraCheck:
     def _follow(
         self,
         rows: Sequence[tuple[int, int, tuple[int, ...]]],
-        counts: np.ndarray,
-        odd: np.ndarray,
+        steady: np.ndarray,
         place: int,
         tolerance: float,
         part: tuple[int, int],
     ) -> None:
         """Note when an encoder is away from where it stood at the start."""
-        home = self._home.setdefault(place, float(np.median(counts[:15])))
-        steady = np.where(odd, np.nan, counts)
+        home = self._home.setdefault(place, float(np.median(steady[:15])))
         far = np.abs(steady - home)
         for i in range(part[0], part[1]):
             if far[i] > tolerance:
                 start, _, most = self._away.get(place, (rows[i][0], 0, 0))
                 size = int(steady[i] - home)
                 self._away[place] = [start, rows[i][0], size if abs(size) > abs(most) else most]
-            elif place in self._away and far[i] <= tolerance:
+            elif place in self._away:
                 start, _, most = self._away.pop(place)
                 self._lens_back(place, start, rows[i][0], most)
 
     def _lens_back(self, place: int, start: int, end: int, far: int) -> None:
         if len(self.account.lens) < MOST:
             self.account.lens.append((start, end, place, far))
+
+
+def _without_spikes(counts: np.ndarray) -> np.ndarray:
+    """Counts (K,) by the median of seven: spikes of three frames are gone, steps stay where they are."""
+    padded = np.pad(counts, 3, mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 7), axis=1)
 
 
 def glitches(steps: np.ndarray) -> np.ndarray:

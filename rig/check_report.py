@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from acino_fte.data_tools.page_parts import number, table
+from acino_fte.data_tools.page_parts import table
 from acino_fte.data_tools.whole_text import write_text_whole
 from acino_fte.rig.check import Check
-from acino_fte.rig.check_types import CameraAccount, ClockJump, Gap, Requirement, StreamAccount
+from acino_fte.rig.check_types import CameraAccount, ClockJump, Gap, Requirement, StreamAccount, length_text
 
 FORMAT = "acino-fte/rig-check/1"
 JSON, PAGE, PICTURE = "check.json", "check.html", "timeline.png"
@@ -192,7 +192,7 @@ def stream_row(stream: StreamAccount) -> tuple[str, ...]:
         f"{stream.rate_hz:.2f}" if stream.rate_hz else "–",
         str(stream.lost),
         f"{stream.delta_loss:.5f}",
-        number(longest if longest else None, "s"),
+        length_text(longest) if longest else "–",
         f"{stream.jitter_ms:.2f} ms" if stream.rate_hz and stream.kind != "image" else "–",
         drift,
     )

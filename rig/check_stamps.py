@@ -22,7 +22,6 @@ _JUMP_NS = 250_000_000  # a step by which two clocks differ more is a jump, or a
 _LONG = 1.5  # periods: a longer step lacks a message
 _STALL = 3.5  # periods: a longer step lacks messages, whatever the frame numbers say
 _UNEVEN = 0.1  # of a period: stamps that scatter more are smoothed first
-_WALL_NS = 20_000_000  # steps of the wall clock that are told
 
 
 class StampCheck:
@@ -230,42 +229,3 @@ def _smoothed(steps: np.ndarray, period: float) -> np.ndarray:
 def _weighted(values: list[tuple[int, float]]) -> float:
     n = sum(k for k, _ in values)
     return sum(k * value for k, value in values) / n if n else 0.0
-
-
-class WallClock:
-    """The computer's wall clock against its monotonic one: jumps, and how fast it is slewed.
-
-    A step counts as a jump when the message after it agrees.
-    """
-
-    def __init__(self) -> None:
-        self.jumps: list[ClockJump] = []
-        self.n = 0
-        self._last: tuple[int, int] | None = None
-        self._first: tuple[int, int] | None = None
-        self._maybe: tuple[int, int, int] | None = None
-
-    def add(self, monotonic_ns: int, wall_ns: int) -> None:
-        """Take one message of any stream, in the order of the recording."""
-        self.n += 1
-        offset = wall_ns - monotonic_ns
-        if self._last is None:
-            self._first = self._last = monotonic_ns, offset
-            return
-        time, before = self._last
-        if abs(offset - before) <= _WALL_NS:
-            self._last, self._maybe = (max(monotonic_ns, time), offset), None
-        elif self._maybe is None or abs(offset - self._maybe[2]) > _WALL_NS:
-            self._maybe = time, monotonic_ns, offset
-        else:
-            after, at, _ = self._maybe
-            self.jumps.append(ClockJump("wall clock", after, at, (offset - before) * 1e-9))
-            self._last, self._maybe = (max(monotonic_ns, at), offset), None
-
-    @property
-    def slew_ppm(self) -> float | None:
-        """How much faster than the monotonic clock it ran between jumps; None of less than a second."""
-        if self._first is None or self._last is None or self._last[0] - self._first[0] < 10**9:
-            return None
-        moved = self._last[1] - self._first[1] - sum(jump.seconds for jump in self.jumps) * 1e9
-        return 1e6 * moved / (self._last[0] - self._first[0])

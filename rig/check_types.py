@@ -10,6 +10,11 @@ _ORDER: tuple[Verdict, ...] = ("pass", "warn", "fail")
 TimeBase = Literal["computer", "device"]
 
 
+def length_text(seconds: float) -> str:
+    """A length of time as it is read best: s, or ms."""
+    return f"{seconds:.2f} s" if seconds >= 0.1 else f"{1e3 * seconds:.1f} ms"
+
+
 def worst(verdicts: list[Verdict]) -> Verdict:
     """The worst of some verdicts; ``pass`` of none."""
     return max(verdicts, key=_ORDER.index, default="pass")

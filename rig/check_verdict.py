@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from acino_fte.rig.check_types import CameraAccount, ClockJump, Requirement, StreamAccount, Verdict
+from acino_fte.rig.check_types import (
+    CameraAccount,
+    ClockJump,
+    Requirement,
+    StreamAccount,
+    Verdict,
+    length_text,
+)
 from acino_fte.rig.check_walk import Findings, LidarAccount
 
 LOSS_WARN, LOSS_FAIL = 0.0, 0.01
@@ -20,14 +27,26 @@ OVERLAP_WARN, OVERLAP_FAIL = 0.95, 0.5
 _FEW = 0.01
 _SHORTER = "expose shorter or close the aperture"
 _LONGER = "take off the cap, expose longer or open the aperture"
-_HEALTH = "clean the window, shade the lidar and check its supply before the next recording"
+_HEALTH = {
+    "temperature": "shade the lidar, or warm it up before you record",
+    "voltage": "check the lidar's supply and its cable",
+    "window": "clean the lidar's window",
+    "motor": "let the lidar rest; if it comes back, send it in",
+    "system": "switch the lidar off and on; if it comes back, send it in",
+    "": "see the lidar's manual before the next recording",
+}
+_CABLES = (
+    "use the stretches without gaps; look at cable, power and USB port of this device, and at the speed of "
+    "the disk (acino-fte doctor)"
+)
+_NETWORK = "give the lidar a network socket of its own, a sound cable and a larger receive buffer"
 
 
 def requirements(found: Findings, unexplained: list[str]) -> list[Requirement]:
     """All lines of the verdict, in the order of what matters."""
     lines = [_readable(found)]
     if found.manifest is not None:
-        lines += [_closed(found), _explained(unexplained)]
+        lines += [_closed(found), *_ended(found), _explained(unexplained)]
     streams = [stream for stream in found.streams.values() if stream.kind != "image" or stream.count]
     streams = [stream for stream in streams if stream.kind != "other"]
     for stream in streams:
@@ -76,6 +95,25 @@ def _closed(found: Findings) -> Requirement:
     return Requirement("closed", "the recording", "pass", state, "closed or recovered")
 
 
+def _ended(found: Findings) -> list[Requirement]:
+    """What ended the recording, or one of its devices, too early."""
+    events = found.manifest.events if found.manifest is not None else ()
+    origin = found.span[0] if found.span else 0
+    out = []
+    for event in events:
+        after = f"after {(event.time_ns - origin) * 1e-9:.1f} s"
+        if event.kind == "disk_full":
+            remedy = "copy recordings to another disk and remove them here before the next one"
+            out.append(
+                Requirement("ended", "the recording", "warn", f"the disk was full {after}", "on time", remedy)
+            )
+        elif event.kind == "error":
+            told = f"{event.detail or 'an error'}, {after}"
+            remedy = "what came until then is sound; acino-fte doctor looks for the reason"
+            out.append(Requirement("error", event.stream or "the rig", "warn", told, "none", remedy))
+    return out
+
+
 def _explained(unexplained: list[str]) -> Requirement:
     if not unexplained:
         return Requirement("explained", "events and data", "pass", "they agree", "nothing unexplained")
@@ -98,16 +136,13 @@ def _loss(stream: StreamAccount) -> Requirement:
     if stream.lost:
         found = (
             f"{stream.lost} of {stream.expected} lost ({100 * stream.lost_share:.2g} %, "
-            f"δ_loss = {stream.delta_loss:.5f}), longest gap {longest:.2f} s"
+            f"δ_loss = {stream.delta_loss:.5f}), longest gap {length_text(longest)}"
         )
     explained = sum(gap.lost for gap in stream.gaps if gap.explained)
     if explained:
         found += f"; {explained} explained by events"
     verdict = _limit(stream.lost_share, LOSS_WARN, LOSS_FAIL)
-    remedy = (
-        "use the stretches without gaps; look at cable, power and USB port of this device, and at the speed "
-        "of the disk (acino-fte doctor)"
-    )
+    remedy = _NETWORK if stream.unit == "packages" else _CABLES
     limit = f"0 lost; at most {100 * LOSS_FAIL:.0f} %"
     return Requirement("no loss", stream.name, verdict, found, limit, remedy if verdict != "pass" else "")
 
@@ -217,15 +252,14 @@ def _returns(lidar: LidarAccount) -> list[Requirement]:
         out.append(
             Requirement(
                 "points", lidar.name, verdict, f"about {lidar.datagrams_lost} datagrams lost", "0",
-                "use a cable and a socket of the computer's own, and a larger receive buffer"
-                if lidar.datagrams_lost else "",
+                _NETWORK if lidar.datagrams_lost else "",
             )
         )  # fmt: skip
     return out
 
 
 def _warned(found: Findings) -> list[Requirement]:
-    if found.kind != "lvx":
+    if not found.health_told:
         return []
     names = [name for name, stream in found.streams.items() if stream.kind == "lidar"]
     out = []
@@ -235,8 +269,10 @@ def _warned(found: Findings) -> list[Requirement]:
             out.append(Requirement("health", name, "pass", "no warnings", "no warnings"))
         for warned in mine:
             verdict: Verdict = "fail" if warned.level >= 2 else "warn"
-            told = f"{warned.text}, in {warned.count} packages"
-            out.append(Requirement("health", name, verdict, told, "no warnings", _HEALTH))
+            since = (warned.first_ns - (found.span[0] if found.span else 0)) * 1e-9
+            told = f"{warned.text}, in {warned.count} packages from {since:.2f} s on"
+            remedy = next(text for word, text in _HEALTH.items() if word in warned.text)
+            out.append(Requirement("health", name, verdict, told, "no warnings", remedy))
     return out
 
 

@@ -25,8 +25,9 @@ from acino_fte.data_tools.recording import (
 from acino_fte.data_tools.rig_reader import RigReader
 from acino_fte.data_tools.rig_recording import Manifest
 from acino_fte.rig.check_camera import MOST, Brightness, CameraCheck
-from acino_fte.rig.check_stamps import StampCheck, WallClock
+from acino_fte.rig.check_stamps import StampCheck
 from acino_fte.rig.check_types import CameraAccount, Gap, StreamAccount, TimeBase, Warned
+from acino_fte.rig.check_wall import WallAccount, WallClock, wall_account
 
 SAMPLED = 24
 """Pictures of a camera that are decoded to tell how bright they are."""
@@ -68,12 +69,14 @@ class Findings:
         Whose clock the times are of.
     streams, cameras, lidars : dict
         By the names of the streams.
-    wall : WallClock
+    wall : WallAccount
     warned : list of Warned
     damage : Damage
         Without what the streams' losses tell already.
     notes : list of str
     manifest : Manifest, optional
+    health_told : bool
+        Whether the format says how the lidar is.
     """
 
     path: Path
@@ -82,11 +85,12 @@ class Findings:
     streams: dict[str, StreamAccount] = field(default_factory=dict)
     cameras: dict[str, CameraAccount] = field(default_factory=dict)
     lidars: dict[str, LidarAccount] = field(default_factory=dict)
-    wall: WallClock = field(default_factory=WallClock)
+    wall: WallAccount = field(default_factory=WallAccount)
     warned: list[Warned] = field(default_factory=list)
     damage: Damage = field(default_factory=Damage)
     notes: list[str] = field(default_factory=list)
     manifest: Manifest | None = None
+    health_told: bool = False
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -141,6 +145,7 @@ class _Walk:
         self._cameras: dict[str, CameraCheck] = {}
         self._bright: dict[str, tuple[Brightness, list[int]]] = {}
         self._returns: dict[str, tuple[array, array, array]] = {}
+        self._walls: dict[str, WallClock] = {}
         self._bare: dict[str, set[int]] = {}
         self._expected: dict[str, float] = {}
         self._lens: list[tuple[int, str, float]] = []
@@ -199,7 +204,7 @@ class _Walk:
             self._stamps[name] = StampCheck(account, steady=self.found.kind == "rig")
         check, received = self._stamps[name], record.received_ns
         if received is not None and record.published_ns is not None and self.found.kind == "rig":
-            self.found.wall.add(received, record.published_ns)
+            self._walls.setdefault(name, WallClock()).add(received, record.published_ns)
         if isinstance(value, ImuSamples):
             for stamp in value.time_ns.tolist():
                 check.add(stamp, received if len(value) == 1 else None)
@@ -255,6 +260,7 @@ class _Walk:
 
     def _close(self) -> None:
         found = self.found
+        found.wall = wall_account(self._walls.values())
         for name, columns in self._returns.items():
             found.lidars[name] = _lidar_account(name, *(np.array(column) for column in columns))
         if isinstance(self.reader, LvxReader):
@@ -345,6 +351,7 @@ def _lvx(reader: LvxReader, found: Findings) -> None:
     """The account of packages, and what the lidars warned of."""
     from acino_fte.rig.check_types import ClockJump
 
+    found.health_told = reader.version != "2"
     said: set[str] = set()
     n_lost = 0
     for name, log in reader.stamp_logs.items():

@@ -60,9 +60,7 @@ def write_folder(
     """Write a folder: a camera of 30 Hz with a video, a lidar of 10 Hz and its inertial sensor of 100 Hz."""
     faults = faults or Faults()
     path.mkdir(parents=True)
-    rng = np.random.default_rng(seed)
-    messages = [m for topic in (INFO, POINTS, IMU) for m in _messages(topic, seconds, faults, rng)]
-    messages.sort(key=lambda m: m[1])
+    messages = rig_messages(faults, seconds, seed)
     segments, counts = [], {INFO: 0, POINTS: 0, IMU: 0}
     for index in range(int(np.ceil(seconds / segment_s))):
         low, high = index * segment_s, (index + 1) * segment_s
@@ -104,6 +102,13 @@ def write_folder(
             ),
         )
     return path
+
+
+def rig_messages(faults: Faults, seconds: float, seed: int = 0) -> list[tuple]:
+    """(topic, log time, value, wall time) of all messages, as they were received."""
+    rng = np.random.default_rng(seed)
+    messages = [m for topic in (INFO, POINTS, IMU) for m in _messages(topic, seconds, faults, rng)]
+    return sorted(messages, key=lambda m: m[1])
 
 
 def picture(number: int, brightness: int = 110) -> np.ndarray:
