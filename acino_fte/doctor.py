@@ -110,6 +110,7 @@ def all_checks() -> tuple[Check, ...]:
         Check("page", "local pages", LIDAR, devices.look_at_page),
         Check("serial", "serial ports", RIG, devices.look_at_serial),
         Check("gpio", "GPIO", RIG, devices.look_at_gpio),
+        Check("devices", "rig devices", RIG, devices.look_at_devices),
         Check("codecs", "video", LIDAR | RIG, devices.look_at_codecs),
         Check("ipopt", "IPOPT", RUN | LIDAR, solver.look_at_ipopt),
         Check("threads", "BLAS threads", frozenset(), solver.look_at_threads),

@@ -23,7 +23,16 @@ WORKERS = (  # side by side; those that import the same in one
     ("import:numpy", "import:scipy", "ipopt", "threads", "explicit", "import:pyomo", "import:casadi"),
     ("import:pandas", "import:xarray", "import:h5netcdf", "import:matplotlib", "import:pypcd4", "import:cv2")
     + ("import:pycolmap",),
-    ("serial", "gpio", "codecs", "import:nicegui", "import:rosbags.highlevel", "import:mcap", "import:av")
+    (
+        "serial",
+        "gpio",
+        "devices",
+        "codecs",
+        "import:nicegui",
+        "import:rosbags.highlevel",
+        "import:mcap",
+        "import:av",
+    )
     + ("import:serial", "import:gpiozero", "import:gpiod"),
 )
 _START = (

@@ -1,4 +1,4 @@
-"""Devices and what reaches them: video encoders, pages in the browser, serial ports, GPIO."""
+"""Devices and what reaches them: video encoders, pages in the browser, serial ports, GPIO, drivers."""
 
 from __future__ import annotations
 
@@ -117,3 +117,25 @@ def look_at_gpio(around: Surroundings) -> Finding:
         return Finding("failed", text, _permission(closed[0]["device"], "gpio"), RIG, answer.value)
     text = ", ".join(f"{Path(c['device']).name} ({c['lines']} lines)" for c in chips if not c["fault"])
     return Finding("ok", text, matters=RIG, details=answer.value)
+
+
+def look_at_devices(around: Surroundings) -> Finding:
+    """The devices of the ``rig.yaml`` here: has each a driver?"""
+    answer = around.answers["devices"]
+    if answer.fault:
+        return Finding("failed", f"cannot be tried: {answer.fault}", 'pip install "acino-fte[rig]"', RIG)
+    found = answer.value
+    if found["faults"]:
+        remedy = found["remedy"] or "install the driver anew"
+        return Finding("failed", "; ".join(found["faults"]), remedy, RIG, found)
+    if not found["file"]:
+        remedy = "acino-fte rig plan --init writes one; name the drivers of your devices in it"
+        return Finding(
+            "note", "no rig.yaml in this folder: recordings can be simulated only", remedy, RIG, found
+        )
+    simulated = [name for name, device in found["devices"].items() if device == "simulated"]
+    if simulated:
+        remedy = "name the drivers of real devices in rig.yaml, after device:"
+        return Finding("note", f"simulated: {', '.join(simulated)}", remedy, RIG, found)
+    text = ", ".join(f"{name}: {device}" for name, device in found["devices"].items())
+    return Finding("ok", text, matters=RIG, details=found)

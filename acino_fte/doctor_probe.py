@@ -246,6 +246,46 @@ def gpio() -> dict[str, Any]:
     return {"chips": chips}
 
 
+def devices() -> dict[str, Any]:
+    """The devices of the ``rig.yaml`` here, which ``acino-fte rig record`` would take, and their drivers.
+
+    Drivers are loaded; no device is opened.
+    """
+    from acino_fte.errors import InputError
+    from acino_fte.rig.rig_read import find_rig_file, read_rig
+    from acino_fte.rig.sources import SIMULATED, find_driver
+
+    found: dict[str, Any] = {"file": "", "devices": {}, "faults": [], "remedy": ""}
+    try:
+        file = find_rig_file()
+        if file is None:
+            return found
+        found["file"] = str(file.resolve())
+        rig = read_rig(file)
+    except InputError as error:
+        return found | {"faults": [_one_line(error)], "remedy": error.remedy or ""}
+    for kind, parts in (("cameras", rig.cameras), ("lidars", rig.lidars)):
+        for name, part in parts.items():
+            found["devices"][name] = part.device
+            if part.device == SIMULATED:
+                continue
+            try:
+                find_driver(part.device, f"{kind}.{name}.device")
+            except InputError as error:
+                found["faults"].append(_one_line(error))
+                found["remedy"] = error.remedy or ""
+            except Exception as error:  # noqa: BLE001 - whatever a driver raises when it is loaded
+                found["faults"].append(f"{name}: {part.device} is broken: {_first_line(error)}")
+    return found
+
+
+def _one_line(error: Any) -> str:
+    text = (
+        error.problem + (f" {error.key}" if error.key else "") + (f": {error.found}" if error.found else "")
+    )
+    return " ".join(text.split())
+
+
 PROBES: dict[str, Callable[[], dict[str, Any]]] = {
     "ipopt": ipopt,
     "explicit": explicit,
@@ -253,4 +293,5 @@ PROBES: dict[str, Callable[[], dict[str, Any]]] = {
     "codecs": codecs,
     "serial": serial,
     "gpio": gpio,
+    "devices": devices,
 }

@@ -40,6 +40,7 @@ WELL = {
     "codecs": Answer({"works": ["libx264"], "faults": {}}),
     "serial": Answer({"ports": []}),
     "gpio": Answer({"chips": []}),
+    "devices": Answer({"file": "", "devices": {}, "faults": [], "remedy": ""}),
 }
 BROKEN = Answer(fault="ImportError: libstrange.so: cannot open shared object file")
 
@@ -450,6 +451,39 @@ def test_gpio(tmp_path, monkeypatch):
     assert look("gpio", tmp_path, {"gpio": BROKEN}).stops("rig")
     monkeypatch.setattr(doctor_devices.platform, "system", lambda: "Darwin")
     assert look("gpio", tmp_path, {"gpio": BROKEN}).state == "note"
+
+
+def devices_here(tmp_path) -> Finding:
+    """Of the rig.yaml in the current folder."""
+    return look("devices", tmp_path, {"devices": Answer(doctor_probe.probe("devices"))})
+
+
+def test_drivers_of_the_rig_here(tmp_path, monkeypatch):
+    from acino_fte.rig import sources
+
+    monkeypatch.chdir(tmp_path)
+    without = devices_here(tmp_path)
+    assert without.state == "note"
+    assert "rig plan --init" in without.remedy
+    file = tmp_path / "rig.yaml"
+    file.write_text("format: acino-fte/rig/1\n")
+    assert "simulated: cam1, lidar1" in devices_here(tmp_path).found
+    file.write_text("format: acino-fte/rig/1\ncameras:\n  cam1: {device: ximea}\nlidars: {}\n")
+    missing = devices_here(tmp_path)
+    assert missing.stops("rig")
+    assert "cameras.cam1.device: ximea" in missing.found
+    monkeypatch.setitem(sources.DRIVERS, "ximea", lambda name, part: None)
+    assert devices_here(tmp_path).found == "cam1: ximea"
+    file.write_text("format: acino-fte/rig/1\ncameras: 3\n")
+    assert devices_here(tmp_path).stops("rig")
+
+    def broken(*_):
+        raise OSError("libm3api.so.2: cannot open shared object file")
+
+    file.write_text("format: acino-fte/rig/1\ncameras:\n  cam1: {device: ximea}\nlidars: {}\n")
+    monkeypatch.setattr(sources, "find_driver", broken)
+    assert "libm3api" in devices_here(tmp_path).found
+    assert look("devices", tmp_path, {"devices": BROKEN}).stops("rig")
 
 
 # The computer
