@@ -122,10 +122,11 @@ def import_recording(
     pivot: Annotated[
         str | None,
         typer.Option(
-            metavar="FRAME=SECONDS|led:X,Y,W,H=SECONDS|knock",
+            metavar="FRAME=SECONDS|strike|led:X,Y,W,H=SECONDS|knock",
             help="One event that video and lidar both have: a frame of the video and the lidar's time, in "
-            "seconds from its first return; a light that goes on in a region of the picture; or a knock on "
-            "the rig.",
+            "seconds from its first return; the strike of a paw, found by itself in keypoints and returns "
+            "(strike:FRAME=SECONDS where you know it roughly); a light that goes on in a region of the "
+            "picture; or a knock on the rig.",
             rich_help_panel=_TIME,
         ),
     ] = None,

@@ -92,7 +92,7 @@ def write_returns(
     """
     counts = {"read": 0, "in_time": 0, "kept": 0}
     with ReturnsWriter(target) as writer:
-        for returns, received in _messages(recording, stream):
+        for returns, received in lidar_messages(recording, stream):
             counts["read"] += len(returns)
             time, keep = to_time(returns.time_ns, received)
             keep &= np.isfinite(returns.xyz).all(axis=1)
@@ -106,7 +106,8 @@ def write_returns(
     return counts
 
 
-def _messages(recording: Path, stream: str) -> Iterator[tuple[LidarReturns, int | None]]:
+def lidar_messages(recording: Path, stream: str) -> Iterator[tuple[LidarReturns, int | None]]:
+    """The messages of a lidar with the times at which they were received."""
     with open_recording(recording) as reader:
         for record in reader.records(kinds=["lidar"], streams=[stream]):
             if isinstance(record.value, LidarReturns) and len(record.value):

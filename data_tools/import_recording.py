@@ -22,6 +22,7 @@ from acino_fte.data_tools.import_motion import Encoders, Poses, encoder_camera, 
 from acino_fte.data_tools.import_notes import doubts, made_by, next_steps, recording_notes, sequence_notes
 from acino_fte.data_tools.import_pictures import MessagePictures, Pictures, VideoPictures, write_pictures
 from acino_fte.data_tools.import_scan import Scan, StreamScan, scan_recording
+from acino_fte.data_tools.import_strike import Animal
 from acino_fte.data_tools.import_sync import Inputs, PivotHint, Timing, per_sample, synchronise
 from acino_fte.data_tools.recording import ImuSamples
 from acino_fte.data_tools.sync import Synchronisation
@@ -171,7 +172,8 @@ def import_recording(
         tell("reading")
         scan = scan_recording(recording, tell)
         inputs = _inputs(scan, video, keypoints, options)
-        inputs = replace(inputs, imu_to_camera=calibration.camera.rotation)
+        animal = Animal(recording, inputs.lidar.name, calibration.camera, keypoints)
+        inputs = replace(inputs, imu_to_camera=calibration.camera.rotation, animal=animal)
         tell("synchronising")
         timing = synchronise(inputs)
         work = _Work(scan, inputs, timing, options, calibration, keypoints, species, tell)

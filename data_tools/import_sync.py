@@ -11,6 +11,7 @@ import numpy as np
 from acino_fte.data_tools.clocks import DeviceClock
 from acino_fte.data_tools.import_pictures import Pictures
 from acino_fte.data_tools.import_scan import StreamScan
+from acino_fte.data_tools.import_strike import Animal, StrikePivot, strike_pivot
 from acino_fte.data_tools.recording import ImuSamples
 from acino_fte.data_tools.sync import Stamps, Synchronisation, clock_of, from_motion, from_pivot, from_stamps
 from acino_fte.data_tools.sync_events import Event, image_motion, knock, lag_of, led_step, region_brightness
@@ -24,21 +25,24 @@ _SEARCHED_S = 10.0  # of the inertial sensor about the frames, that a match must
 _MOTION_S = 40.0  # of video in which motion is measured
 _LEAST_MOTION_S = 1.5
 _EVEN = 0.25  # of a period: stamps whose steps vary less are those of a video that counts its frames
-_PIVOT = "FRAME=SECONDS, led:X,Y,W,H=SECONDS or knock"
+_PIVOT = "FRAME=SECONDS, strike, strike:FRAME=SECONDS, led:X,Y,W,H=SECONDS or knock"
+_HAND = 0.25  # s: how far a strike may lie from what the user says of it; half a stride and more
 
 
 @dataclass(frozen=True)
 class PivotHint:
-    """What the user says of one event: a frame, a light's region, or that there was a knock."""
+    """What the user says of one event: a frame, a light's region, a knock, or a paw's strike."""
 
-    kind: Literal["frame", "led", "knock"]
-    frame: float = 0.0
+    kind: Literal["frame", "led", "knock", "strike"]
+    frame: float | None = None
     region: tuple[int, int, int, int] = (0, 0, 0, 0)
     seconds: float = 0.0
 
 
 def pivot_hint(text: str | None) -> PivotHint | None:
-    """``FRAME=SECONDS``, ``led:X,Y,W,H=SECONDS`` or ``knock``; seconds from the lidar's first return.
+    """``FRAME=SECONDS``, ``strike[:FRAME=SECONDS]``, ``led:X,Y,W,H=SECONDS`` or ``knock``.
+
+    Seconds are from the lidar's first return; those of a strike are known roughly.
 
     Raises
     ------
@@ -51,6 +55,10 @@ def pivot_hint(text: str | None) -> PivotHint | None:
     plain = text.strip().lower()
     if plain == "knock":
         return PivotHint("knock")
+    if plain == "strike":
+        return PivotHint("strike")
+    if match := re.fullmatch(rf"strike:\s*({number})\s*=\s*({number})s?", plain):
+        return PivotHint("strike", frame=float(match[1]), seconds=float(match[2]))
     if match := re.fullmatch(rf"({number})\s*=\s*({number})s?", plain):
         return PivotHint("frame", frame=float(match[1]), seconds=float(match[2]))
     if match := re.fullmatch(rf"led:\s*(\d+),(\d+),(\d+),(\d+)\s*=\s*({number})s?", plain):
@@ -79,6 +87,8 @@ class Inputs:
     pivot : PivotHint, optional
     imu_to_camera : (3, 3), optional
         How the inertial sensor sits on the camera.
+    animal : Animal, optional
+        What shows it in video and lidar.
     """
 
     lidar: StreamScan
@@ -91,6 +101,7 @@ class Inputs:
     expected: int | None = None
     pivot: PivotHint | None = None
     imu_to_camera: np.ndarray | None = None
+    animal: Animal | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +201,10 @@ def _by_stamps(inputs: Inputs, timing: Timing) -> tuple[Synchronisation, np.ndar
 
 def _delayed(sync: Synchronisation, inputs: Inputs, timing: Timing, same: bool) -> Synchronisation:
     """Take the camera's constant delay off, as an event or the motion tells it; else state it as unknown."""
+    if inputs.pivot is not None and inputs.pivot.kind == "strike":
+        strike = _strike(inputs, timing, sync.frame_time, (-_LONGEST_LATENCY, _LONGEST_LATENCY))
+        sync = replace(sync, notes=(*sync.notes, strike.note))
+        return _shifted(sync, strike.lag, 1e3 * strike.sd, "the strike of a paw")
     if inputs.pivot is not None:
         pivot, sd_ms = _pivot_of(inputs, timing, sync.fps)
         at = float(np.interp(pivot[0], np.arange(inputs.n_frames), sync.frame_time))
@@ -268,11 +283,18 @@ def _by_event(inputs: Inputs, timing: Timing) -> Synchronisation:
     if grid is not None:
         fps = inputs.fps or 1 / grid.period
     origin = timing.sync.origin_ns
-    if inputs.pivot is not None:
+    notes: tuple[str, ...] = ()
+    if inputs.pivot is not None and inputs.pivot.kind == "strike":
+        base = from_pivot(inputs.n_frames, fps, (0, 0.0), pivot_sd_ms=0.0, expected=expected, grid=grid)
+        strike = _strike(inputs, timing, base.frame_time, None)
+        pivot, sd_ms, notes = (strike.frame, strike.time), 1e3 * strike.sd, (strike.note,)
+    elif inputs.pivot is not None:
         pivot, sd_ms = _pivot_of(inputs, timing, fps)
-        return from_pivot(
+    if inputs.pivot is not None:
+        found = from_pivot(
             inputs.n_frames, fps, pivot, pivot_sd_ms=sd_ms, expected=expected, grid=grid, origin_ns=origin
         )
+        return replace(found, notes=(*notes, *found.notes))
     if inputs.pictures is None or inputs.imu is None:
         missing = "no pictures" if inputs.pictures is None else "no inertial sensor in the recording"
         raise InputError(
@@ -280,8 +302,9 @@ def _by_event(inputs: Inputs, timing: Timing) -> Synchronisation:
             key="--pivot",
             expected="stamps of the camera in the recording, or one event: " + _PIVOT,
             found=missing,
-            remedy="find an event that video and lidar both show, as a paw that touches the ground, and give "
-            "its frame and the lidar's time of it (seconds from its first return): --pivot 120=3.45",
+            remedy="with keypoints of a running animal: --pivot strike. Or find an event that video and "
+            "lidar both show, and give its frame and the lidar's time (seconds from its first return): "
+            "--pivot 120=3.45",
         )
     start, stop = _motion_frames(inputs, fps)
     part = image_motion(inputs.pictures.frames(start, stop))
@@ -300,6 +323,38 @@ def _by_event(inputs: Inputs, timing: Timing) -> Synchronisation:
         method="motion",
         notes=(*base.notes, note),
     )
+
+
+def _strike(
+    inputs: Inputs, timing: Timing, frame_time: np.ndarray, lags: tuple[float, float] | None
+) -> StrikePivot:
+    """The strike of a paw; where the user says roughly when it was, about that."""
+    hint = inputs.pivot
+    if inputs.animal is None or hint is None:
+        raise InputError("There is nothing that shows a paw's strike.", key="--pivot", expected=_PIVOT)
+
+    def to_seconds(stamps: np.ndarray, received: int | None) -> np.ndarray:
+        return timing.seconds(timing.lidar, stamps, received)
+
+    if hint.frame is not None:
+        _check_pivot_frame(hint.frame, inputs.n_frames)
+        if lags is None:
+            at = hint.seconds - float(np.interp(hint.frame, np.arange(inputs.n_frames), frame_time))
+            lags = (at - _HAND, at + _HAND)
+    period = float(np.median(np.diff(frame_time)))
+    frames = _motion_frames(inputs, 1 / period)
+    return strike_pivot(inputs.animal, to_seconds, frame_time, frames, lags, hint.frame)
+
+
+def _check_pivot_frame(frame: float, n_frames: int) -> None:
+    if not 0 <= frame <= n_frames - 1:
+        raise InputError(
+            "The pivot frame is not in the video.",
+            key="--pivot",
+            expected=f"0 to {n_frames - 1}",
+            found=f"{frame:g}",
+            remedy="count frames of the video from 0",
+        )
 
 
 def _own_grid(inputs: Inputs, own: Stamps | None) -> tuple[FrameGrid | None, float]:
@@ -332,15 +387,9 @@ def _pivot_of(inputs: Inputs, timing: Timing, fps: float) -> tuple[tuple[float, 
         raise InputError("There is no pivot.", key="--pivot", expected=_PIVOT)
     half_frame = 1e3 / np.sqrt(12) / fps
     if hint.kind == "frame":
-        if not 0 <= hint.frame <= inputs.n_frames - 1:
-            raise InputError(
-                "The pivot frame is not in the video.",
-                key="--pivot",
-                expected=f"0 to {inputs.n_frames - 1}",
-                found=f"{hint.frame:g}",
-                remedy="count frames of the video from 0",
-            )
-        return (hint.frame, hint.seconds), float(np.sqrt(2) * half_frame)
+        frame = hint.frame or 0.0
+        _check_pivot_frame(frame, inputs.n_frames)
+        return (frame, hint.seconds), float(np.sqrt(2) * half_frame)
     if inputs.pictures is None:
         raise InputError(
             "There are no pictures in which to find the event.", key="--pivot", remedy="give --video"
