@@ -5,8 +5,8 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
@@ -18,6 +18,7 @@ from acino_fte.cli_common import EXIT_OTHER, reported_errors, stdout
 from acino_fte.errors import InputError
 
 if TYPE_CHECKING:
+    from acino_fte.rig.drive_keys import Keyboard
     from acino_fte.rig.drive_session import DriveSession, DriveStatus
     from acino_fte.rig.joystick import Adc
 
@@ -61,7 +62,8 @@ def drive(
     Example: acino-fte rig drive --simulate
     """
     with reported_errors():
-        from acino_fte.rig.drive_setup import open_session, open_simulated, state_folder
+        from acino_fte.rig.drive_setup import open_session, open_simulated
+        from acino_fte.rig.encoders_store import state_folder
         from acino_fte.rig.rig_file import RigFile
         from acino_fte.rig.rig_read import find_rig_file, read_rig
 
@@ -93,27 +95,37 @@ def _drive(session: DriveSession, simulated: bool) -> None:
 
     from acino_fte.rig.drive_keys import Keyboard
     from acino_fte.rig.drive_screen import screen
-    from acino_fte.rig.drive_session import LOOP_S
 
     title = _TITLE + ("  (simulated)" if simulated else "")
     try:
         with _ends_by_signal(), Keyboard() as keyboard, Live(screen=True, auto_refresh=False) as live:
-            turn = 0
-            while True:
-                began = time.monotonic()
-                keys = keyboard.read()
-                if "q" in keys or "Q" in keys:
-                    break
-                state = session.step(keys)
-                if turn % 5 == 0:
-                    live.update(screen(state, title), refresh=True)
-                turn += 1
-                time.sleep(max(0.0, LOOP_S - (time.monotonic() - began)))
-    except KeyboardInterrupt:
-        pass  # the usual way to leave
+            try:
+                _loop(session, keyboard, lambda state: live.update(screen(state, title), refresh=True))
+            finally:
+                session.stop()  # before anything is done with the terminal
+    except (KeyboardInterrupt, OSError):
+        pass  # the usual way to leave; a terminal that was closed
     finally:
         session.close()
-    stdout.print("The motors are stopped.")
+    with suppress(OSError):
+        stdout.print("The motors are stopped.")
+
+
+def _loop(session: DriveSession, keyboard: Keyboard, show: Callable[[DriveStatus], None]) -> None:
+    """Fifty turns a second, until q."""
+    from acino_fte.rig.drive_session import LOOP_S
+
+    turn = 0
+    while True:
+        began = time.monotonic()
+        keys = keyboard.read()
+        if "q" in keys or "Q" in keys:
+            return
+        state = session.step(keys)
+        if turn % 5 == 0:
+            show(state)
+        turn += 1
+        time.sleep(max(0.0, LOOP_S - (time.monotonic() - began)))
 
 
 def _look(session: DriveSession, simulated: bool) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import sys
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
@@ -79,7 +80,8 @@ class Keyboard:
         import termios
 
         if self._before is not None:
-            termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+            with suppress(termios.error):  # of a terminal that was closed
+                termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def read(self) -> list[str]:
         """Keys since the last time; ``"q"`` when the terminal is gone."""

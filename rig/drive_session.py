@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from acino_fte.rig.encoders import Encoder, Reading, ReportedCounts
+from acino_fte.rig.encoders_shared import CountsWriter
 from acino_fte.rig.encoders_store import PositionStore
 from acino_fte.rig.joystick import Joystick
 from acino_fte.rig.motors import LinkOutput, MotorControl
@@ -86,6 +87,8 @@ class DriveSession:
         Without one the keys do.
     store : PositionStore, optional
         Where positions outlive the program.
+    shared : CountsWriter, optional
+        Where a recorder finds the counts.
     clock : callable
         Monotonic time in ns.
     """
@@ -97,11 +100,12 @@ class DriveSession:
         *,
         joystick: Joystick | None = None,
         store: PositionStore | None = None,
+        shared: CountsWriter | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.axes, self.link, self.joystick = tuple(axes), link, joystick
         self.driven = tuple(axis for axis in axes if axis.motor is not None)
-        self._store, self._clock = store, clock
+        self._store, self._shared, self._clock = store, shared, clock
         self._interruptions = 0
         self._asked: tuple[str, int] | None = None
         self._stick_moved = [False] * len(self.driven)
@@ -154,13 +158,15 @@ class DriveSession:
                 if axis.encoder is not None:
                     axis.encoder.save(at_rest=True)
             self.link.close()
+            if self._shared:
+                self._shared.close()
             if self._store:
                 self._store.close()
 
     def status(self, now_ns: int) -> DriveStatus:
         """What the screen says."""
         link, good = self._link_text(now_ns)
-        notes = [self._note, self._store.trouble if self._store else ""]
+        notes = [self._note, *(part.trouble for part in (self._store, self._shared) if part)]
         stick = "none: arrow keys drive"
         if self.joystick:
             stick = self.joystick.trouble or "ready"
@@ -173,6 +179,9 @@ class DriveSession:
         for axis in self.axes:
             if axis.encoder is not None:
                 axis.encoder.poll(now_ns)
+        if self._shared:
+            counts = [axis.encoder.counts if axis.encoder else None for axis in self.axes]
+            self._shared.write([count or 0 for count in counts], now_ns)
 
     def _listen(self, now_ns: int) -> None:
         """Reports of the microcontroller; whether it was gone."""

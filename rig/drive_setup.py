@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from functools import partial
@@ -13,6 +12,7 @@ import numpy as np
 from acino_fte.errors import InputError
 from acino_fte.rig.drive_session import Axis, DriveSession
 from acino_fte.rig.encoders import Encoder, LineCounts, ReportedCounts
+from acino_fte.rig.encoders_shared import CountsWriter
 from acino_fte.rig.encoders_store import PositionStore
 from acino_fte.rig.gpio import EdgeBatch, open_edges
 from acino_fte.rig.joystick import Axis as StickAxis
@@ -28,13 +28,6 @@ from acino_fte.rig.serial_link_simulated import SimulatedController, SimulatedPo
 _USUAL = {"zoom": 1, "focus": 2}
 _TRAVEL = {1: (-2600.0, 6900.0), 2: (-4100.0, 5400.0)}  # of the simulated rings
 Clock = Callable[[], int]
-
-
-def state_folder(simulated: bool = False) -> Path:
-    """Where positions and the calibration of the joystick are kept from one day to the next."""
-    base = os.environ.get("XDG_STATE_HOME") or os.environ.get("LOCALAPPDATA")
-    root = Path(base) if base else Path.home() / ".local" / "state"
-    return root / "acino-fte" / ("rig-simulated" if simulated else "rig")
 
 
 def open_session(
@@ -69,7 +62,7 @@ def open_session(
         for name, part in rig.encoders.items()
     ]
     link = SerialLink(partial(open_port, port), tuple(numbers.values()))
-    return DriveSession(axes, link, joystick=joystick, store=store, clock=clock)
+    return DriveSession(axes, link, joystick=joystick, store=store, shared=CountsWriter(folder), clock=clock)
 
 
 def open_simulated(
@@ -87,7 +80,9 @@ def open_simulated(
         else:
             source = LineCounts(SimulatedHead(part.counts_per_turn, clock, 0.5 if name == "pan" else 0.1))
             axes.append(Axis(name, Encoder(name, source, part.counts_per_turn, store=store)))
-    return DriveSession(axes, SerialLink(port.open, tuple(motors)), store=store, clock=clock)
+    return DriveSession(
+        axes, SerialLink(port.open, tuple(motors)), store=store, shared=CountsWriter(folder), clock=clock
+    )
 
 
 def motor_numbers(rig: RigFile) -> dict[str, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -38,6 +39,13 @@ class Stored:
     sure: bool
     index_at: int | None = None
     limits: tuple[int, int] | None = None
+
+
+def state_folder(simulated: bool = False) -> Path:
+    """Where positions and the calibration of the joystick are kept from one day to the next."""
+    base = os.environ.get("XDG_STATE_HOME") or os.environ.get("LOCALAPPDATA")
+    root = Path(base) if base else Path.home() / ".local" / "state"
+    return root / "acino-fte" / ("rig-simulated" if simulated else "rig")
 
 
 class PositionStore:

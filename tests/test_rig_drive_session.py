@@ -15,6 +15,7 @@ from acino_fte.rig.drive_screen import said, screen, where
 from acino_fte.rig.drive_session import Axis, DriveSession
 from acino_fte.rig.drive_setup import motor_numbers, open_session, open_simulated
 from acino_fte.rig.encoders import Encoder, ReportedCounts
+from acino_fte.rig.encoders_shared import SharedCounts
 from acino_fte.rig.encoders_store import PositionStore
 from acino_fte.rig.joystick import Axis as StickAxis
 from acino_fte.rig.joystick import Joystick, SimulatedAdc
@@ -242,6 +243,35 @@ def test_the_screen_says_what_the_operator_must_know(tmp_path):
     rig = Rig()
     text = shown(rig.run(0.1))
     assert "50.0 %" in text and "●" in text and "ends unknown" not in text
+
+
+def test_a_recorder_gets_the_counts_of_the_program_that_drives(tmp_path):
+    now = [10**9]
+    rig = RigFile()
+    reader = SharedCounts("encoders", rig.encoders, folder=tmp_path, clock=lambda: now[0])
+    assert reader.counts() == ()
+    session = open_simulated(rig, tmp_path, clock=lambda: now[0])
+    for _ in range(100):
+        now[0] += STEP
+        status = session.step(["right"])
+    counts = reader.counts()
+    assert counts == tuple(axis.reading.counts for axis in status.axes)
+    assert counts[0] > 1000 and counts[2] != 0
+    second = open_simulated(rig, tmp_path, clock=lambda: now[0])
+    assert any("another program drives" in note for note in second.step().notes)
+    second.close(wait=lambda seconds: None)
+    assert reader.counts() == counts
+    assert SharedCounts("encoders", {"zoom": 1}, folder=tmp_path, clock=lambda: now[0]).counts() == ()
+    whole = (tmp_path / "counts.bin").read_bytes()
+    (tmp_path / "counts.bin").write_bytes(whole[:-3] + b"abc")  # half written
+    assert reader.counts() == ()
+    (tmp_path / "counts.bin").write_bytes(whole)
+    now[0] += 600_000_000  # it hangs
+    assert reader.counts() == ()
+    session.step()
+    assert len(reader.counts()) == 4
+    session.close(wait=lambda seconds: None)
+    assert reader.counts() == ()
 
 
 def test_a_real_rig_without_anything_plugged_in_waits(tmp_path, monkeypatch):
