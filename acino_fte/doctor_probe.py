@@ -176,6 +176,8 @@ def _openblas_threads() -> int | None:
 
 def codecs() -> dict[str, Any]:
     """Encode some pictures with every H.264 encoder that may be here, and read those of libx264 again."""
+    import av  # noqa: F401 - a missing package is one fault, not one of every encoder
+
     works, faults = [], {}
     for name in ("libx264", *HARDWARE_H264):
         try:
