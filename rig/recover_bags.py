@@ -1,82 +1,17 @@
-"""Rescue of ROS 1 bags and MCAP files: every whole message, byte for byte, into a new file with an index."""
+"""What the rescues of bags share: counts by an index, the account, and messages whose channel is lost."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from functools import partial
-from pathlib import Path
-from typing import Any
-
-from acino_fte.data_tools.bags_mcap import MAGIC, McapWalk, _chunk_fields
-from acino_fte.data_tools.bags_ros1 import Ros1Walk, parse_fields
-from acino_fte.data_tools.bags_window import Losses, Messages, RawMessage
-from acino_fte.errors import InputError
-from acino_fte.extras import missing_package
+from acino_fte.data_tools.bags_window import FileWalk
 from acino_fte.rig.recover_types import Noted, Salvaged, Tally, elsewhere
 
-_SCHEMA, _CHANNEL, _ATTACHMENT, _METADATA, _DATA_END, _FOOTER = 3, 4, 9, 12, 15, 2
-_HEAD = 9  # bytes of a record of MCAP before its content
-_STAMPS = 22  # bytes of a message of MCAP before its data
+UNKNOWN = "recovered/msg/Unknown"
+"""Type of messages whose own is lost."""
+_MOST_CHANNELS = 1000
+_EARLIEST_NS = 10**18  # 2001
 
 
-# ROS 1 ---------------------------------------------------------------------------------------------------
-
-
-class _Ros1(Ros1Walk):
-    """A walk that keeps the heads of connections, and goes on where the file's first bytes are lost."""
-
-    def __init__(self, path: Path, losses: Losses) -> None:
-        self.heads: dict[int, dict[bytes, bytes]] = {}
-        self.compression = ""
-        try:
-            super().__init__(path, losses)
-        except InputError:
-            with path.open("rb") as file:
-                if file.read(9) == b"#ROSBAG V":  # of another version
-                    raise
-            losses.note("the first bytes of the bag are damaged")
-
-    def _connection(self, fields: dict[bytes, bytes], data: bytes) -> None:
-        super()._connection(fields, data)
-        self.heads.setdefault(int.from_bytes(fields[b"conn"], "little"), parse_fields(data) or {})
-
-    def _chunk(self, window: Any, fields: dict[bytes, bytes], skip: int, length: int) -> Any:
-        self.compression = self.compression or fields[b"compression"].decode("latin1")
-        return super()._chunk(window, fields, skip, length)
-
-
-def salvage_ros1(source: Path, target: Path | None) -> Salvaged:
-    """Copy every whole message of a ROS 1 bag.
-
-    Parameters
-    ----------
-    source : Path
-        The bag; only read.
-    target : Path, optional
-        The new bag, with the same compression; without it the messages are only counted.
-    """
-    losses, tally = Noted(), Tally()
-    walk = _Ros1(source, losses)
-    indexed = walk.overview()
-    said = _by_topic(walk) if indexed else None
-    for channel in walk.channels.values():
-        tally.name(channel.topic, channel.type)
-    write = _Ros1Writer(walk, target) if target is not None else None
-    try:
-        for message in walk.messages(payloads=target is not None):
-            tally.add(message.channel.topic, message.channel.type, message.received_ns, losses.n_notes)
-            if write is not None:
-                write.message(message)
-        if write is not None:
-            write.close()
-    finally:
-        if write is not None:
-            write.abort()
-    return _salvaged("ROS 1 bag", losses, tally, said, indexed)
-
-
-def _by_topic(walk: Ros1Walk | McapWalk) -> dict[str, int]:
+def by_topic(walk: FileWalk) -> dict[str, int]:
     """Counts by topic of a sound index."""
     out = dict.fromkeys((channel.topic for channel in walk.channels.values()), 0)
     for number, count in walk.counts.items():
@@ -85,7 +20,8 @@ def _by_topic(walk: Ros1Walk | McapWalk) -> dict[str, int]:
     return out
 
 
-def _salvaged(form: str, losses: Noted, tally: Tally, said: dict[str, int] | None, indexed: bool) -> Salvaged:
+def salvaged(form: str, losses: Noted, tally: Tally, said: dict[str, int] | None, indexed: bool) -> Salvaged:
+    """The account of a walk; `said`: counts by topic, `indexed`: whether the file's own index is sound."""
     streams = tally.streams(said)
     damage = losses.damage()
     lost = sum(stream.lost for stream in streams)
@@ -95,270 +31,15 @@ def _salvaged(form: str, losses: Noted, tally: Tally, said: dict[str, int] | Non
         streams,
         elsewhere(losses, streams),
         damage.bytes_lost,
-        tuple(_sentence(place) for place in damage.places),
+        tuple(sentence(place) for place in damage.places),
     )
 
 
-def _sentence(place: str) -> str:
+def sentence(place: str) -> str:
+    """A place of damage as a sentence."""
     return place[:1].upper() + place[1:] + ("" if place.endswith(".") else ".")
 
 
-class _Ros1Writer:
-    """Writes a bag; its compression is known with the first message."""
-
-    def __init__(self, walk: _Ros1, target: Path) -> None:
-        self._walk, self._target = walk, target
-        self._writer: Any = None
-        self._connections: dict[int, Any] = {}
-
-    def message(self, message: RawMessage) -> None:
-        """Write one message as it is."""
-        if self._writer is None:
-            self._open()
-        key = id(message.channel)  # channels may be equal and yet be two
-        if key not in self._connections:
-            self._connections[key] = self._connection(message)
-        self._writer.write(self._connections[key], message.received_ns, message.data)
-
-    def _open(self) -> None:
-        try:
-            from rosbags.rosbag1 import Writer
-        except ImportError as error:
-            raise missing_package("Bags", error) from error
-        self._writer = Writer(self._target)
-        if self._walk.compression in ("bz2", "lz4"):
-            self._writer.set_compression(Writer.CompressionFormat[self._walk.compression.upper()])
-        self._writer.open()
-
-    def _connection(self, message: RawMessage) -> Any:
-        channel = message.channel
-        number = next(n for n, known in self._walk.channels.items() if known is channel)
-        head = self._walk.heads.get(number, {})
-        caller = head.get(b"callerid")
-        latching = head.get(b"latching", b"")
-        options: dict[str, Any] = {
-            "msgdef": channel.definition,
-            "md5sum": head.get(b"md5sum", b"*").decode("latin1") or "*",
-            "callerid": caller.decode("utf-8", "replace") if caller is not None else None,
-            "latching": int(latching) if latching.isdigit() else None,
-        }
-        for connection in self._writer.connections:  # two that say the same of themselves become one
-            if (connection.topic, connection.msgtype) == (channel.topic, channel.type) and (
-                connection.ext.callerid,
-                connection.ext.latching,
-                connection.digest,
-            ) == (options["callerid"], options["latching"], options["md5sum"]):
-                return connection
-        return self._writer.add_connection(channel.topic, channel.type, **options)
-
-    def close(self) -> None:
-        """End the bag with its index."""
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-
-    def abort(self) -> None:
-        """Leave a bag that was not ended."""
-        if self._writer is not None:
-            with suppress(Exception):  # noqa: BLE001 - the file is thrown away
-                self._writer.bio.close()
-
-
-# MCAP ----------------------------------------------------------------------------------------------------
-
-
-class _Mcap(McapWalk):
-    """A walk that keeps schemas, channels and messages as they stand in the file."""
-
-    def __init__(self, path: Path, losses: Losses) -> None:
-        super().__init__(path, losses)
-        self.schema_bytes: dict[int, bytes] = {}
-        self.channel_bytes: dict[int, bytes] = {}
-        self.compression: str | None = None
-        with path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                losses.note("the first bytes of the file are damaged")
-
-    def _define(self, op: int, content: bytes) -> None:
-        super()._define(op, content)
-        kept = {_SCHEMA: self.schema_bytes, _CHANNEL: self.channel_bytes}.get(op)
-        if kept is not None:
-            kept.setdefault(int.from_bytes(content[:2], "little"), content)
-
-    def _message(self, content: bytes, place: str) -> Messages:
-        """The message with its number, stamps and channel before its data."""
-        for message in super()._message(content, place):
-            yield RawMessage(message.channel, message.received_ns, content)
-
-    def _chunk(self, window: Any, length: int) -> Any:
-        fields = _chunk_fields(window.peek(_HEAD + 64)[_HEAD:])
-        if self.compression is None and fields is not None:
-            self.compression = fields[2]
-        return super()._chunk(window, length)
-
-
-def salvage_mcap(source: Path, target: Path | None) -> Salvaged:
-    """Copy every whole message of an MCAP file, with its stamps, sequence number, schema and channel.
-
-    Parameters
-    ----------
-    source : Path
-        The file; only read.
-    target : Path, optional
-        The new file, with the same compression; without it the messages are only counted.
-    """
-    losses, tally = Noted(), Tally()
-    walk = _Mcap(source, losses)
-    indexed = walk.overview()
-    said = _by_topic(walk) if indexed and walk.counts else None
-    for channel in walk.channels.values():
-        tally.name(channel.topic, channel.type)
-    if target is None:
-        for message in walk.messages(payloads=False):
-            tally.add(message.channel.topic, message.channel.type, message.received_ns, losses.n_notes)
-    else:
-        with target.open("wb") as file:
-            write = _McapWriter(walk, file, _profile(source))
-            for message in walk.messages():
-                tally.add(message.channel.topic, message.channel.type, message.received_ns, losses.n_notes)
-                write.message(message)
-            write.close(_extras(source))
-    topics = {channel.topic: _topic(walk, number) for number, channel in walk.channels.items()}
-    found = _salvaged("MCAP file", losses, tally, said, indexed)
-    return Salvaged(
-        found.form, found.whole, found.streams, found.lost_elsewhere, found.bytes_lost, found.notes, topics
-    )
-
-
-def _load_mcap() -> Any:
-    try:
-        import mcap.data_stream
-        import mcap.records
-        import mcap.writer
-    except ImportError as error:
-        raise missing_package("MCAP files", error) from error
-    return mcap
-
-
-class _McapWriter:
-    """Writes an MCAP file; its compression is known with the first message."""
-
-    def __init__(self, walk: _Mcap, file: Any, profile: str) -> None:
-        self._walk, self._file, self._profile = walk, file, profile
-        self._mcap = _load_mcap()
-        self._writer: Any = None
-        self._channels: dict[int, int] = {}
-        self._schemas: dict[int, int] = {}
-
-    def _open(self) -> Any:
-        if self._writer is None:
-            form = (self._walk.compression or "none").upper()
-            self._writer = self._mcap.writer.Writer(
-                self._file, compression=self._mcap.writer.CompressionType[form]
-            )
-            self._writer.start(self._profile, "acino-fte rig recover")
-        return self._writer
-
-    def message(self, message: RawMessage) -> None:
-        """Write one message as it is."""
-        writer, content = self._open(), message.data
-        number = int.from_bytes(content[:2], "little")
-        if number not in self._channels:
-            self._channels[number] = self._channel(writer, number)
-        writer.add_message(
-            self._channels[number],
-            log_time=message.received_ns,
-            data=content[_STAMPS:],
-            publish_time=int.from_bytes(content[14:22], "little"),
-            sequence=int.from_bytes(content[2:6], "little"),
-        )
-
-    def _channel(self, writer: Any, number: int) -> int:
-        channel = _record(self._mcap, "Channel", self._walk.channel_bytes[number])
-        schema = 0
-        if channel.schema_id in self._walk.schema_bytes:
-            schema = self._schema(writer, channel.schema_id)
-        return int(
-            writer.register_channel(channel.topic, channel.message_encoding, schema, dict(channel.metadata))
-        )
-
-    def _schema(self, writer: Any, number: int) -> int:
-        if number not in self._schemas:
-            schema = _record(self._mcap, "Schema", self._walk.schema_bytes[number])
-            self._schemas[number] = writer.register_schema(schema.name, schema.encoding, schema.data)
-        return self._schemas[number]
-
-    def close(self, extras: Iterator[Callable[[Any], None]]) -> None:
-        """Write what else the file had, and the index."""
-        writer = self._open()
-        for extra in extras:
-            extra(writer)
-        writer.finish()
-
-
-def _record(mcap: Any, kind: str, content: bytes) -> Any:
-    """A record of the package ``mcap`` from its bytes."""
-    import io
-
-    stream = mcap.data_stream.ReadDataStream(io.BytesIO(content))
-    cls = getattr(mcap.records, kind)
-    return cls.read(stream, len(content)) if kind == "Chunk" else cls.read(stream)
-
-
-def _topic(walk: _Mcap, number: int) -> dict[str, str]:
-    """What metadata.yaml of ROS 2 says of a topic."""
-    channel = walk.channels[number]
-    out = {"name": channel.topic, "type": channel.type, "serialization_format": "cdr"}
-    with suppress(KeyError, ValueError, IndexError):
-        record = _record(_load_mcap(), "Channel", walk.channel_bytes[number])
-        out["serialization_format"] = record.message_encoding
-        out["offered_qos_profiles"] = record.metadata.get("offered_qos_profiles", "")
-        out["type_description_hash"] = record.metadata.get("topic_type_hash", "")
-    return out
-
-
-def _outer(source: Path) -> Iterator[tuple[int, Any, int]]:
-    """(op, file, bytes) of records outside of chunks, up to the first damage; the file stands at each."""
-    size = source.stat().st_size
-    with source.open("rb") as file:
-        at = len(MAGIC)
-        while True:
-            file.seek(at)
-            head = file.read(_HEAD)
-            length = int.from_bytes(head[1:], "little")
-            if len(head) < _HEAD or not 1 <= head[0] <= 0x0F or at + _HEAD + length > size:
-                return
-            if head[0] in (_DATA_END, _FOOTER):
-                return
-            yield head[0], file, length
-            at += _HEAD + length
-
-
-def _profile(source: Path) -> str:
-    """The profile that the file's head names, such as ``ros2``."""
-    for op, file, length in _outer(source):
-        content = file.read(length) if op == 1 else b""
-        n = int.from_bytes(content[:4], "little")
-        return content[4 : 4 + n].decode("utf-8", "replace")
-    return ""
-
-
-def _extras(source: Path) -> Iterator[Callable[[Any], None]]:
-    """Attachments and metadata, as calls of a writer."""
-    mcap = _load_mcap()
-    for op, file, length in _outer(source):
-        if op not in (_ATTACHMENT, _METADATA):
-            continue
-        try:
-            record = _record(mcap, "Attachment" if op == _ATTACHMENT else "Metadata", file.read(length))
-        except (ValueError, KeyError, IndexError, OverflowError):
-            continue
-        yield partial(_add_attachment if op == _ATTACHMENT else _add_metadata, record)
-
-
-def _add_attachment(record: Any, writer: Any) -> None:
-    writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
-
-
-def _add_metadata(record: Any, writer: Any) -> None:
-    writer.add_metadata(record.name, record.metadata)
+def plausible(number: int, stamp_ns: int) -> bool:
+    """Whether a message of an unknown channel can be one: few channels, and a time of this century."""
+    return number < _MOST_CHANNELS and _EARLIEST_NS < stamp_ns < 4 * _EARLIEST_NS

@@ -24,7 +24,7 @@ from acino_fte.data_tools.bags_ecal import EcalWalk, _text, _topic, _type
 from acino_fte.data_tools.bags_serial import CUSTOM, DecodeError, decode, definitions
 from acino_fte.data_tools.ros_messages import LIVOX_PACKAGES, XIMEA_TYPE
 from acino_fte.errors import InputError
-from acino_fte.rig.recover_bags import _sentence
+from acino_fte.rig.recover_bags import sentence
 from acino_fte.rig.recover_types import Noted, Salvaged, Tally, elsewhere
 
 _LAYOUT = re.compile(rb"\x08\0\x18\0.\0\0\0\x03\x01(.{8})(.{8})", re.DOTALL)
@@ -114,7 +114,7 @@ def salvage_ecal(source: Path, target: Path | None, like: Path | None = None) ->
         streams,
         elsewhere(losses, streams),
         damage.bytes_lost,
-        (*notes, *(_sentence(place) for place in damage.places)),
+        (*notes, *(sentence(place) for place in damage.places)),
     )
 
 

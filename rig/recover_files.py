@@ -21,6 +21,8 @@ FileKind = Literal["ros1", "mcap", "sqlite", "ecal", "zstd", "lvx", "video"]
 _BY_SUFFIX: dict[str, FileKind] = {
     ".bag": "ros1",
     ".mcap": "mcap",
+    ".db3": "sqlite",
+    ".hdf5": "ecal",
     ".lvx": "lvx",
     ".lvx2": "lvx",
     **dict.fromkeys(VIDEO_SUFFIXES, "video"),
@@ -98,11 +100,11 @@ def salvage_file(path: Path, target: Path | None, settings: Settings) -> Salvage
             problems = (problem,) if problem else ()
             return replace(found, whole=found.whole and not problem, notes=(*problems, *found.notes))
     if kind == "ros1":
-        from acino_fte.rig.recover_bags import salvage_ros1
+        from acino_fte.rig.recover_ros1 import salvage_ros1
 
         return salvage_ros1(path, target)
     if kind == "mcap":
-        from acino_fte.rig.recover_bags import salvage_mcap
+        from acino_fte.rig.recover_mcap import salvage_mcap
 
         return salvage_mcap(path, target)
     if kind == "sqlite":
@@ -163,7 +165,7 @@ def _seems_sound(path: Path, kind: FileKind) -> bool:
     try:
         return bool(walk(path, Losses()).overview())
     except InputError:
-        return kind == "ros1" and bag_kind(path) == "ros1"  # of another version: said by the walk itself
+        return False
 
 
 def count_of(path: Path, kind: FileKind) -> int:

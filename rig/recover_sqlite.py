@@ -10,12 +10,15 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from acino_fte.data_tools.bags_serial import LAYOUTS
 from acino_fte.data_tools.bags_sqlite import _BROKEN, Pages, SqliteWalk, _is_message, _page_size
-from acino_fte.data_tools.bags_window import ZSTD, Losses, Messages, RawMessage
-from acino_fte.rig.recover_bags import _sentence
+from acino_fte.data_tools.bags_window import ZSTD, Channel, Losses, Messages, RawMessage
+from acino_fte.rig.recover_bags import UNKNOWN, by_topic, sentence
 from acino_fte.rig.recover_types import Noted, Salvaged, Tally, elsewhere
 
 _JOURNAL_HEAD = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"  # of a rollback journal that is still to be used
+_PAGE = 4096  # bytes, of SQLite where nothing else is said
+_MOST_TOPICS = 1000
 _BATCH = 500
 _TABLES = """
 CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
@@ -66,6 +69,11 @@ class _Rows(SqliteWalk):
                     self.more.setdefault(number, (texts[0], texts[1]))
 
     def _message(self, topic: Any, stamp: Any, data: Any) -> Messages:
+        if topic not in self.channels and isinstance(topic, int) and 0 < topic < _MOST_TOPICS:
+            self.losses.note(f"the topic {topic} is not told of: its name and type are lost")
+            self.channels[topic] = Channel(
+                f"/recovered/topic_{topic}", UNKNOWN, "", "ros2msg", LAYOUTS["cdr"], 2
+            )
         channel = self.channels.get(topic)
         if channel is None or not isinstance(stamp, int) or not isinstance(data, bytes):
             self.losses.note(f"a message is of the unknown topic {topic}", 1)
@@ -79,10 +87,9 @@ class _Rows(SqliteWalk):
         with self.path.open("rb") as file:
             head = file.read(100)
             size = _page_size(head)
-            if len(head) < 100 or not size:
-                self.losses.note("the head of the database is damaged")
-                return
-            pages = Pages(file, size, size - head[20], self._log)
+            if not size:
+                self.losses.note("the head of the database is damaged: it is read as rosbag2 writes it")
+            pages = Pages(file, size or _PAGE, size - head[20] if size else _PAGE, self._log)
             try:
                 self._find_topics(pages)
                 leaves = ((pages.first_row(page), page) for page in range(1, pages.count + 1))
@@ -123,12 +130,7 @@ def salvage_sqlite(source: Path, target: Path | None) -> Salvaged:
         if logged:
             notes.append("A write-ahead log lay beside it: what it holds was merged into the copy.")
         sound = walk.overview()
-        said = None
-        if sound:
-            said = dict.fromkeys((channel.topic for channel in walk.channels.values()), 0)
-            for number, count in walk.counts.items():
-                if number in walk.channels:
-                    said[walk.channels[number].topic] += count
+        said = by_topic(walk) if sound else None
         for channel in walk.channels.values():
             tally.name(channel.topic, channel.type)
         if target is None:
@@ -145,7 +147,7 @@ def salvage_sqlite(source: Path, target: Path | None) -> Salvaged:
         streams,
         elsewhere(losses, streams),
         damage.bytes_lost,
-        (*notes, *(_sentence(place) for place in damage.places)),
+        (*notes, *(sentence(place) for place in damage.places)),
         {channel.topic: _about(walk, number) for number, channel in walk.channels.items()},
     )
 

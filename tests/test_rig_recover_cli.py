@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from acino_fte.cli import app
 from acino_fte.errors import InputError
 from acino_fte.rig import recover as module
-from acino_fte.rig import recover_bags
+from acino_fte.rig import recover_mcap
 from acino_fte.rig.recover import recover
 
 pytest.importorskip("rosbags")
@@ -113,7 +113,7 @@ def test_the_copy_is_whole_or_absent(cut, monkeypatch):
         ("message", broken, "ddrescue"),
     ):
         with monkeypatch.context() as patch, pytest.raises(InputError, match=says):
-            patch.setattr(recover_bags._McapWriter, name, what)
+            patch.setattr(recover_mcap._McapWriter, name, what)
             recover(cut)
         assert state(cut.parent) == before and len(list(cut.parent.iterdir())) == 1
     with monkeypatch.context() as patch, pytest.raises(InputError, match="no room"):
