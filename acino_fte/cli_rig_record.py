@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _SIMULATION = "Simulation"
 _QUIET_EVENTS = ("started", "stopped")
+_MOST_EVENTS = 20
 _LINE_EVERY_S = 10.0  # where the output is no terminal
 
 
@@ -176,6 +177,8 @@ class _Line:
 
 def status_line(status: Status) -> str:
     """One line: state, time, frames a second of every stream, losses, room on the disk."""
+    from acino_fte.rig.recorder_types import gigabytes
+
     minutes, seconds = divmod(int(status.elapsed_s), 60)
     rates = " ".join(f"{name.strip('/')} {fps:.0f}/s" for name, fps in _rates(status).items())
     parts = [f"{status.state.upper()} {minutes:02d}:{seconds:02d}", rates or "starting"]
@@ -189,7 +192,7 @@ def status_line(status: Status) -> str:
         if status.minutes_left >= 120
         else f"{status.minutes_left:.0f} min"
     )
-    parts.append(f"{status.free_bytes / 1e9:.1f} GB free, {left} left")
+    parts.append(f"{gigabytes(status.free_bytes)} free, {left} left")
     return " | ".join(parts)
 
 
@@ -201,27 +204,37 @@ def _conclude(session: Session, manifest: Manifest, seconds: float | None, quiet
     """What happened; the exit code."""
     from acino_fte.rig.recorder_verdict import unexplained
 
-    for event in manifest.events:
-        if event.kind in _QUIET_EVENTS:
-            continue
+    _tell_events(manifest)
+    bad = unexplained(manifest, session.options.faults)
+    for sentence in bad:
+        stderr.print(f"[bold red]lost:[/] {escape(sentence)}")
+    lasted = ((manifest.ended_ns or manifest.started_ns) - manifest.started_ns) * 1e-9
+    unwritten = session.recorder.unwritten if session.recorder is not None else ""
+    whole = not unwritten and all(segment.closed for segment in manifest.segments)
+    if not quiet:
+        streams = (stream for stream in manifest.streams if stream.kind != "image_info")
+        counts = ", ".join(f"{stream.name.strip('/')} {stream.written}" for stream in streams)
+        size = sum(segment.n_bytes for segment in manifest.segments)
+        stdout.print(f"{lasted:.1f} s, {size / 1e6:.1f} MB: {counts}", markup=False)
+        look = f"look at it: acino-fte rig check {session.folder}"
+        stdout.print(f"written to {session.folder}" + (f"; {look}" if whole else ""), markup=False)
+    if not whole:
+        warn(
+            f"not all could be closed: rescue it with acino-fte rig recover {session.folder} {unwritten}".strip()
+        )
+    early = any(event.kind in ("disk_full", "error") for event in manifest.events)
+    if bad or not whole or (early and seconds is not None and lasted < seconds - 1):
+        raise typer.Exit(EXIT_OTHER)
+
+
+def _tell_events(manifest: Manifest) -> None:
+    """The events, one line each."""
+    events = [event for event in manifest.events if event.kind not in _QUIET_EVENTS]
+    for event in events[:_MOST_EVENTS]:
         at = (event.time_ns - manifest.started_ns) * 1e-9
         more = f" for {event.seconds:.2f} s" if event.seconds > 0 and event.kind != "clock_jump" else ""
         count = f", {event.count} missing" if event.count else ""
         name = f" {event.stream.strip('/')}" if event.stream else ""
         warn(f"at {at:.2f} s: {event.kind.replace('_', ' ')}{name}{more}{count}: {event.detail}")
-    bad = unexplained(manifest, session.options.faults)
-    for sentence in bad:
-        stderr.print(f"[bold red]lost:[/] {escape(sentence)}")
-    lasted = ((manifest.ended_ns or manifest.started_ns) - manifest.started_ns) * 1e-9
-    if not quiet:
-        counts = ", ".join(
-            f"{s.name.strip('/')} {s.written}" for s in manifest.streams if s.kind != "image_info"
-        )
-        size = sum(segment.n_bytes for segment in manifest.segments)
-        stdout.print(f"{lasted:.1f} s, {size / 1e6:.1f} MB: {escape(counts)}", markup=False)
-        stdout.print(
-            f"written to {escape(str(session.folder))}; look at it: acino-fte rig check {session.folder}"
-        )
-    early = any(event.kind in ("disk_full", "error") for event in manifest.events)
-    if bad or (early and seconds is not None and lasted < seconds - 1):
-        raise typer.Exit(EXIT_OTHER)
+    if len(events) > _MOST_EVENTS:
+        warn(f"and {len(events) - _MOST_EVENTS} more: manifest.json has them all")

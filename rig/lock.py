@@ -45,10 +45,13 @@ class RigLock:
     def __enter__(self) -> RigLock:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            file = os.fdopen(os.open(self.path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)
+            file = _open(self.path)
         except OSError as error:
             raise InputError(
-                "The lock of the rig cannot be made.", file=self.path, found=error.strerror or str(error)
+                "The lock of the rig cannot be made.",
+                file=self.path,
+                found=error.strerror or str(error),
+                remedy="where another user's recorder left it: remove the file",
             ) from None
         held = _hold(file)
         before = _content(file)
@@ -87,6 +90,17 @@ class RigLock:
 def lock_path(folder: Path, rig: str) -> Path:
     """The lock of the rig of this name among those in a folder."""
     return folder / f"acino-fte-rig-{sha256(rig.encode()).hexdigest()[:12]}.lock"
+
+
+def _open(path: Path) -> IO[bytes]:
+    """Open the file, or make it for every user of the computer."""
+    try:
+        number = os.open(path, os.O_RDWR)
+    except FileNotFoundError:
+        number = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        with suppress(OSError):
+            path.chmod(0o666)
+    return os.fdopen(number, "r+b", buffering=0)
 
 
 def _hold(file: IO[bytes]) -> bool:

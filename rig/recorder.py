@@ -25,7 +25,7 @@ from acino_fte.errors import InputError
 from acino_fte.rig.recorder_clock import Stamper, VirtualClock
 from acino_fte.rig.recorder_events import EventLog, LensWatch, Watch
 from acino_fte.rig.recorder_readers import Reader, ReaderThread
-from acino_fte.rig.recorder_types import Equipment, Status, expected_bytes_per_s
+from acino_fte.rig.recorder_types import Equipment, Status, expected_bytes_per_s, gigabytes
 from acino_fte.rig.rig_file import RigFile
 from acino_fte.rig.sources import Source, SourceStream, camera_topic
 from acino_fte.rig.writers import CameraWriter, SensorWriter
@@ -246,7 +246,7 @@ class Recorder:
             self._turn(index)
         free = self._free()
         if free < self._rig.storage.reserve_gb * 1e9:
-            self._disk_full(f"{free / 1e9:.1f} GB are free: the reserve is reached")
+            self._disk_full(f"{gigabytes(free)} are free: the reserve is reached")
         if self._every and log_ns - self._triggered_ns > 1.5e9 * self._every / self._first_fps():
             self._trigger()  # the camera is silent; the lidar goes on
         if self.log.taken():

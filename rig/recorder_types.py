@@ -71,3 +71,8 @@ def expected_bytes_per_s(rig: RigFile) -> float:
         for part in rig.lidars.values()
     )
     return max(cameras + lidars, 1.0)
+
+
+def gigabytes(n_bytes: float) -> str:
+    """A size in words: ``1.5 GB``, ``20 MB``."""
+    return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.0f} MB"

@@ -24,13 +24,13 @@ from acino_fte.rig.faults import Fault, disk_is_full
 from acino_fte.rig.lock import RigLock, lock_path
 from acino_fte.rig.recorder import Recorder
 from acino_fte.rig.recorder_clock import Clock
-from acino_fte.rig.recorder_types import Equipment, Status, expected_bytes_per_s
+from acino_fte.rig.recorder_types import Equipment, Status, expected_bytes_per_s, gigabytes
 from acino_fte.rig.rig_file import FILE_NAME, RigFile
 from acino_fte.rig.rig_read import rig_text
 from acino_fte.rig.simulated import SimulatedRig
 from acino_fte.rig.sources import DeviceGone, Source, real_counts, real_sources
 from acino_fte.rig.writers_messages import prepare
-from acino_fte.rig.writers_video import RAW, SOFTWARE, choose_codec
+from acino_fte.rig.writers_video import LOSSLESS, RAW, SOFTWARE, choose_codec
 
 State = Literal["idle", "preflight", "recording", "closing"]
 _NEXT: dict[State, tuple[State, ...]] = {
@@ -164,10 +164,9 @@ class Session:
         self._to("preflight")
         try:
             prepare()
-            made = not self.folder.exists()
-            checks = [self._lock(), *self._room()]
-            if made:
+            if not self.folder.exists():
                 self._stack.callback(self._remove_empty)
+            checks = [*self._room(), self._lock()]
             checks += [*self._devices(), *self._encoders(), self._clock_set(), *self._codecs()]
         except BaseException:
             self._abandon()
@@ -197,16 +196,18 @@ class Session:
             self.folder.rmdir()
 
     def _lock(self) -> Check:
-        where = self.folder.resolve().parent if self.equipment.simulated else Path(gettempdir())
-        lock = self._stack.enter_context(RigLock(lock_path(where, self.rig.name), self.folder))
+        """Of the rig; simulated ones are as many as there are places to record to."""
+        where = f" {self.folder.resolve().parent}" if self.equipment.simulated else ""
+        path = lock_path(Path(gettempdir()), self.rig.name + where)
+        lock = self._stack.enter_context(RigLock(path, self.folder))
         return Check("lock", not lock.taken_over, lock.taken_over or f"the rig {self.rig.name} is free")
 
     def _room(self) -> list[Check]:
         """Room on the disk, and how fast it is."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            speed = _disk_speed(self.folder) if self.options.probe else None
             free = self.equipment.free_bytes(self.folder)
+            speed = _disk_speed(self.folder) if self.options.probe and free > 4 * _PROBE_BYTES else None
         except OSError as error:
             raise InputError(
                 "The recording cannot be written here.",
@@ -220,7 +221,7 @@ class Session:
         checks = [
             Check(
                 "disk", minutes >= _LEAST_MINUTES,
-                f"{free / 1e9:.1f} GB are free, {self.rig.storage.reserve_gb:g} GB stay so: "
+                f"{gigabytes(free)} are free, {self.rig.storage.reserve_gb:g} GB of them are kept: "
                 f"room for {minutes:.0f} min",
                 "free some space, or choose another disk with --out", fatal=True,
             )
@@ -281,7 +282,11 @@ class Session:
         checks = []
         for name, camera in self.rig.cameras.items():
             codec = self.equipment.codecs[name] = choose_codec(camera)
-            kind = {SOFTWARE: " (on the processor)", RAW: " (every pixel kept)"}.get(codec, " (hardware)")
+            kind = {
+                SOFTWARE: " (on the processor)",
+                RAW: " (every pixel kept)",
+                LOSSLESS: " (every pixel kept)",
+            }.get(codec, " (hardware)")
             checks.append(Check(f"video of {name}", True, codec + kind))
         return checks
 

@@ -15,7 +15,8 @@ from acino_fte.rig.rig_file import CameraPart
 from acino_fte.rig.writers import missing_package
 
 HARDWARE = ("h264_nvenc", "h264_v4l2m2m", "h264_vaapi", "h264_videotoolbox")
-SOFTWARE, RAW = "libx264", "rawvideo"
+SOFTWARE, RAW, LOSSLESS = "libx264", "rawvideo", "ffv1"
+"""Lossless is for what Matroska does not take raw: colours, grey of more than 8 bits."""
 CLUSTER_MS = 200
 _OPTIONS = {"libx264": {"preset": "ultrafast", "tune": "zerolatency"}, "h264_nvenc": {"zerolatency": "1"}}
 _TRIAL = 5  # frames that an encoder must give back
@@ -36,7 +37,7 @@ def load_av() -> Any:
 def choose_codec(part: CameraPart) -> str:
     """The encoder for a camera's video: one in the hardware that gives back every frame, else x264."""
     if part.codec == "raw":
-        return RAW
+        return RAW if part.bits <= 8 else LOSSLESS
     return next((name for name in HARDWARE if _works(name, part)), SOFTWARE)
 
 
@@ -59,7 +60,7 @@ def _works(name: str, part: CameraPart) -> bool:
 
 def _set_up(context: Any, part: CameraPart, name: str) -> None:
     """Settings of an encoder: low delay, a key frame a second, the rate of the rig."""
-    if name == RAW:
+    if name in (RAW, LOSSLESS):
         context.pix_fmt = "gray" if part.bits <= 8 else "gray16le"
     else:
         even = part.width % 2 == 0 and part.height % 2 == 0
@@ -120,12 +121,13 @@ class VideoFile:
         self.last_ns: int | None = None
         options = {"cluster_time_limit": str(CLUSTER_MS), "flush_packets": "1"}
         self._container = self._av.open(self._file, "w", format="matroska", options=options)
+        codec = LOSSLESS if codec == RAW and pixels.ndim == 3 else codec
         rate = Fraction(part.fps).limit_denominator(1000)
         self._stream = self._container.add_stream(codec, rate=rate)
         self._stream.width, self._stream.height = pixels.shape[1], pixels.shape[0]
         _set_up(self._stream.codec_context, part, codec)
-        if pixels.ndim == 3 and codec == RAW:
-            self._stream.codec_context.pix_fmt = "rgb24"
+        if pixels.ndim == 3 and codec == LOSSLESS:
+            self._stream.codec_context.pix_fmt = "bgr0"
         self._form = self._stream.codec_context.pix_fmt
 
     def write(self, pixels: np.ndarray, log_ns: int) -> None:
