@@ -178,6 +178,7 @@ class Encoder:
         stored = store.get(name) if store else None
         self._last_known = stored.counts if stored else 0
         self._index_at = stored.index_at if stored else None
+        self._zero_known = self._index_at is not None
         self._sure_at_start = bool(stored and stored.at_rest and stored.sure and self_locking)
         self._offset: int | None = None
         self._index_seen: int | None = None
@@ -234,7 +235,7 @@ class Encoder:
         self._history = deque((when, value + shift) for when, value in self._history)
         if self._index_at is not None:
             self._index_at += shift
-        self.sure = True
+        self.sure = self._zero_known = True
         self.save(at_rest=self._resting)
 
     def interrupted(self) -> None:
@@ -244,7 +245,8 @@ class Encoder:
     def save(self, *, at_rest: bool) -> None:
         """Store the position."""
         if self._store and self.counts is not None:
-            self._store.put(self.name, Stored(self.counts, at_rest, self.sure, self._index_at))
+            index = self._index_at if self._zero_known else None
+            self._store.put(self.name, Stored(self.counts, at_rest, self.sure, index))
 
     def _take_up(self, raw: int) -> None:
         """After an interruption: the counter went on, or began again where the shaft stood."""
@@ -268,7 +270,7 @@ class Encoder:
         if self.sure:
             self.missed += abs(error)
         self._offset -= error
-        self.sure = True
+        self.sure = self._zero_known
 
     def _remember(self, counts: int, now_ns: int) -> None:
         moved = bool(self._history) and counts != self._history[-1][1]

@@ -141,6 +141,21 @@ def test_the_index_finds_the_angle_again_and_counts_what_was_lost(tmp_path):
     assert encoder.counts % 4000 == 110
 
 
+def test_an_index_without_a_zero_makes_nothing_sure(tmp_path):
+    store = PositionStore(tmp_path)
+    lines = SimulatedEdges(clock=lambda: 10**9)
+    encoder = Encoder("pan", LineCounts(lines), 4000.0, store=store)
+    encoder.poll(0)
+    for k in (1, 2):
+        lines.push(Edges(np.array([k]), np.array([Z], np.int8), np.array([1], np.int8)))
+        encoder.source.index_position = None
+        encoder.poll(k)
+    assert not encoder.sure
+    encoder.save(at_rest=True)
+    store.close()
+    assert store.get("pan").index_at is None
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "x"}', None])
 def test_a_damaged_file_of_positions_is_told_and_stops_nothing(tmp_path, text):
     if text is None:

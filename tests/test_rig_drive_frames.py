@@ -90,19 +90,35 @@ def test_partial_and_overlong_lines():
     assert max(len(frame(m, 255)) for m in (Count(1, -(2**31)), Turns(2, -999999.5))) < MAX_LINE
 
 
-@pytest.mark.parametrize("alphabet", [bytes(range(256)), b"t12058-\r\n", b"$*tre120358-ACF\n"])
-def test_a_million_fuzzed_bytes(alphabet):
+@pytest.mark.parametrize(
+    ("alphabet", "n"), [(bytes(range(256)), N), (b"t12058-\r\n", N), (b"$*tre120358-ACF\n", N // 4)]
+)
+def test_a_million_fuzzed_bytes(alphabet, n):
     """Any bytes, and those of which messages are made: plain takes what is a command, framed nothing."""
     rng = np.random.default_rng(len(alphabet))
-    data = rng.choice(np.frombuffer(alphabet, np.uint8), N).tobytes()
+    data = rng.choice(np.frombuffer(alphabet, np.uint8), n).tobytes()
     plain, framed = PlainLines("device"), FramedLines("device")
     taken = []
-    for piece in pieces(data, rng):
+    for piece in pieces(data, rng, 400):
         taken += plain.feed(piece)
         assert framed.feed(piece) == []
     lines = [line.removesuffix(b"\r") for line in data.split(b"\n")[:-1]]
     assert taken == [COMMANDS[line] for line in lines if line in COMMANDS]
     assert framed.counts.refused > 3000
+
+
+def test_fuzzed_bytes_at_the_computer():
+    """Reports: every one that is taken is spelt in the bytes as it would be sent."""
+    rng = np.random.default_rng(5)
+    data = rng.choice(np.frombuffer(b"pppprr1122.-0\n\n\n\n", np.uint8), N // 4).tobytes()
+    plain, framed = PlainLines("host"), FramedLines("host")
+    taken = [message for piece in pieces(data, rng, 400) for message in plain.feed(piece)]
+    assert framed.feed(data) == []
+    lines = set(data.split(b"\n"))
+    counts = [message for message in taken if isinstance(message, Count)]
+    assert len(counts) > 300 and len(taken) > len(counts)
+    assert all(body(message) in lines for message in counts)
+    assert all(np.isfinite(message.turns) for message in taken if isinstance(message, Turns))
 
 
 def damaged(frames, rng):

@@ -325,3 +325,41 @@ def test_the_command(command, tmp_path, monkeypatch):
     ):
         found = command(*words)
         assert found.exit_code == 2 and text in found.output, words
+
+
+@pytest.mark.parametrize("end", ["q", KeyboardInterrupt, OSError])
+def test_however_the_command_ends_the_motors_stop(command, monkeypatch, end):
+    """The key that quits, Ctrl-C, a terminal that is gone: in the middle of driving."""
+    made = []
+
+    class Controller(SimulatedController):
+        def __init__(self, *words, **options):
+            super().__init__(*words, **options)
+            made.append(self)
+
+    class Keys:
+        turns = 0
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def read(self):
+            self.turns += 1
+            driven = made[0].motors[1].power > 0.1
+            assert self.turns < 500
+            if driven and end == "q":
+                return ["q"]
+            if driven:
+                raise end
+            return ["right"]
+
+    monkeypatch.setattr(drive_setup, "SimulatedController", Controller)
+    monkeypatch.setattr("acino_fte.rig.drive_keys.Keyboard", Keys)
+    found = command("--simulate")
+    assert found.exit_code == 0 and "The motors are stopped." in found.output
+    assert all(motor.power == 0 for motor in made[0].motors.values())
+    speeds = [message.speed for _, message in made[0].commands]
+    assert max(speeds) > 80 and speeds[-6:] == [0] * 6
