@@ -219,9 +219,8 @@ def _conclude(session: Session, manifest: Manifest, seconds: float | None, quiet
         look = f"look at it: acino-fte rig check {session.folder}"
         stdout.print(f"written to {session.folder}" + (f"; {look}" if whole else ""), markup=False)
     if not whole:
-        warn(
-            f"not all could be closed: rescue it with acino-fte rig recover {session.folder} {unwritten}".strip()
-        )
+        remedy = f"acino-fte rig recover {session.folder} rescues it"
+        warn(f"not all could be closed; {remedy} {unwritten}".strip())
     early = any(event.kind in ("disk_full", "error") for event in manifest.events)
     if bad or not whole or (early and seconds is not None and lasted < seconds - 1):
         raise typer.Exit(EXIT_OTHER)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import socket
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Event as Flag
 from threading import Lock, Thread
@@ -366,10 +367,11 @@ class Recorder:
         """The recording at this moment."""
         elapsed = self._clock.elapsed_s
         written = {name: n for reader in self._readers for name, n in dict(reader.writer.written).items()}
+        received = {name: watch.received for name, watch in self._watches.items()}
         before, counts, fps = self._rates
         if elapsed - before >= 1.0:
-            fps = {name: (n - counts.get(name, 0)) / (elapsed - before) for name, n in written.items()}
-            self._rates = (elapsed, written, fps)
+            fps = {name: (n - counts.get(name, 0)) / (elapsed - before) for name, n in received.items()}
+            self._rates = (elapsed, received, fps)
         free = self._free() if free is None else free
         room = free - self._rig.storage.reserve_gb * 1e9
         return Status(
@@ -385,7 +387,10 @@ class Recorder:
     def _bytes_per_s(self, elapsed: float) -> float:
         """What is written, B/s: as measured, or as expected at the beginning."""
         if elapsed > _RATE_FROM_S:
-            size = sum(path.stat().st_size for path in self.folder.iterdir() if path.is_file())
+            size = 0
+            for name in list(self._segments):
+                with suppress(OSError):
+                    size += (self.folder / name).stat().st_size
             if size:
                 return size / elapsed
         return expected_bytes_per_s(self._rig)

@@ -13,6 +13,8 @@ STALL_PERIODS, STALL_S = 5.0, 0.3
 """A stream is silent when nothing came for so many periods, and for so long (s)."""
 TOGETHER_S = 1.0
 """Losses of one stream within so much of each other are one event, s."""
+ENCODERS = "encoders"
+"""Stream of events about the counts that come with the images."""
 
 
 class EventLog:
@@ -208,9 +210,15 @@ class LensWatch:
         self._rings, self._camera, self._log = list(rings), camera, log
         self._home: dict[str, int] = {}
         self._away: dict[str, int] = {}
+        self._unknown: int | None = None
 
     def seen(self, log_ns: int, counts: Sequence[int]) -> None:
-        """Counts that came with an image."""
+        """Counts that came with an image; none where nothing is known of the encoders."""
+        if self._home and not counts and self._unknown is None:
+            detail = "nothing tells where the lens is; it still lasts"
+            self._unknown = self._log.add("stall", log_ns, ENCODERS, detail=detail)
+        elif counts and self._unknown is not None:
+            self._known(log_ns)
         for place, name, tolerance in self._rings:
             if place >= len(counts):
                 continue
@@ -226,16 +234,23 @@ class LensWatch:
                     "lens_back", log_ns, self._camera, detail=f"{name} is back within its tolerance"
                 )
 
+    def _known(self, log_ns: int) -> None:
+        if self._unknown is not None:
+            seconds = (log_ns - self._log.get(self._unknown).time_ns) * 1e-9
+            self._log.change(self._unknown, seconds=seconds, detail="nothing told where the lens is")
+            self._unknown = None
+
     def _end(self, name: str, log_ns: int) -> None:
         number = self._away.pop(name)
         self._log.change(number, seconds=(log_ns - self._log.get(number).time_ns) * 1e-9)
 
     def close(self, now_ns: int) -> None:
         """The recording ends."""
+        self._known(now_ns)
         for name in list(self._away):
             self._end(name, now_ns)
 
     @property
     def moved(self) -> bool:
-        """Whether the calibration does not hold at the moment."""
-        return bool(self._away)
+        """Whether the calibration does not hold at the moment, or nothing is known of it."""
+        return bool(self._away) or self._unknown is not None

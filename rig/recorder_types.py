@@ -16,8 +16,8 @@ from acino_fte.rig.sources import Counts, Source
 class Status:
     """A recording at one moment: what the line on the screen says.
 
-    `fps` and `written` by stream; `waiting` is how full the fullest queue is, 0 to 1; `minutes_left` until
-    the disk is full.
+    `fps` (what comes) and `written` are by stream, `waiting` is how full the fullest queue is, 0 to 1, and
+    `minutes_left` until the disk is full.
     """
 
     state: str

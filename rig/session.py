@@ -267,9 +267,9 @@ class Session:
         if not self.rig.encoders or not self.rig.cameras:
             return []
         names = ", ".join(self.rig.encoders)
-        if self.equipment.counts is not None:
+        if self.equipment.counts is not None and self.equipment.counts.counts():
             return [Check("encoders", True, names)]
-        remedy = "docs/rig_devices.md says how a driver is made known"
+        remedy = "run acino-fte rig drive in another window"
         return [Check("encoders", False, f"nothing reads {names}: images carry no counts", remedy)]
 
     def _clock_set(self) -> Check:

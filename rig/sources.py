@@ -184,15 +184,18 @@ def real_sources(rig: RigFile) -> list[Source]:
 
 
 def real_counts(rig: RigFile) -> Counts | None:
-    """What reads the encoders of a rig: the driver ``encoders``, where there is one."""
+    """What reads the encoders of a rig: the driver ``encoders``, else what ``acino-fte rig drive`` shares."""
     from importlib.metadata import entry_points
+
+    from acino_fte.rig.encoders_shared import SharedCounts
 
     if not rig.encoders:
         return None
     if ENCODERS in DRIVERS:
         return DRIVERS[ENCODERS](ENCODERS, rig.encoders)
     found = [point for point in entry_points(group=ENTRY_POINTS) if point.name == ENCODERS]
-    return found[0].load()(ENCODERS, rig.encoders) if found else None
+    driver = found[0].load() if found else SharedCounts
+    return driver(ENCODERS, rig.encoders)
 
 
 def camera_topic(camera: str) -> str:

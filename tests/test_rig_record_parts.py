@@ -110,6 +110,7 @@ def test_the_lens_is_watched_within_its_tolerance():
         ("lens_moved", 20, 0.01, "zoom"),
         ("lens_back", 30, 0.0, "zoom"),
         ("lens_moved", 40, 0.02, "focus"),
+        ("stall", 50, 0.01, "nothing"),
     ]
 
 
