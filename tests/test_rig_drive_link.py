@@ -2,12 +2,14 @@
 
 import os
 import select
+import sys
 import tty
 from pathlib import Path
 
 import pytest
 
 from acino_fte.errors import InputError
+from acino_fte.rig.gpio import GpiozeroEdges, open_edges
 from acino_fte.rig.motors_simulated import FULL_SPEED, SimulatedGearmotor
 from acino_fte.rig.serial_frames import Count, Throttle, Turns, frame
 from acino_fte.rig.serial_link import LISTEN_NS, RETRY_NS, SerialLink, SerialPort, find_port
@@ -236,3 +238,14 @@ def test_a_port_that_is_none(tmp_path):
         link = SerialLink(lambda path=path: SerialPort(str(path)))
         assert link.poll(0) == []
         assert not link.connected and link.trouble
+
+
+def test_missing_packages_name_the_remedy(monkeypatch):
+    for name in ("serial", "serial.tools.list_ports", "gpiod", "gpiozero"):
+        monkeypatch.setitem(sys.modules, name, None)
+    link = SerialLink(lambda: SerialPort("/dev/ttyACM0"))
+    link.poll(0)
+    assert "acino-fte[rig]" in link.trouble
+    for needs in (find_port, lambda: open_edges("gpiochip0 1 2"), lambda: GpiozeroEdges([1, 2])):
+        with pytest.raises(InputError, match=r"acino-fte\[rig\]"):
+            needs()
