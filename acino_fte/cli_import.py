@@ -179,9 +179,9 @@ def import_recording(
             _inspect(recording, quiet)
             return
         from acino_fte.data_tools.import_notes import summary
+        from acino_fte.data_tools.import_pivot import pivot_hint
         from acino_fte.data_tools.import_recording import ImportOptions
         from acino_fte.data_tools.import_recording import import_recording as run
-        from acino_fte.data_tools.import_sync import pivot_hint
 
         options = ImportOptions(
             video=video,

@@ -21,9 +21,10 @@ from acino_fte.data_tools.import_lidar import write_returns
 from acino_fte.data_tools.import_motion import Encoders, Poses, encoder_camera, posed_camera
 from acino_fte.data_tools.import_notes import doubts, made_by, next_steps, recording_notes, sequence_notes
 from acino_fte.data_tools.import_pictures import MessagePictures, Pictures, VideoPictures, write_pictures
+from acino_fte.data_tools.import_pivot import PivotHint
 from acino_fte.data_tools.import_scan import Scan, StreamScan, scan_recording
 from acino_fte.data_tools.import_strike import Animal
-from acino_fte.data_tools.import_sync import Inputs, PivotHint, Timing, per_sample, synchronise
+from acino_fte.data_tools.import_sync import Inputs, Timing, per_sample, synchronise
 from acino_fte.data_tools.recording import ImuSamples
 from acino_fte.data_tools.sync import Synchronisation
 from acino_fte.errors import InputError, did_you_mean

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from acino_fte.data_tools.clocks import DeviceClock
+from acino_fte.data_tools.import_clocks import device_clocks
 from acino_fte.data_tools.import_pictures import Pictures
+from acino_fte.data_tools.import_pivot import PIVOTS, PivotHint
 from acino_fte.data_tools.import_scan import StreamScan
 from acino_fte.data_tools.import_strike import Animal, StrikePivot, strike_pivot
 from acino_fte.data_tools.recording import ImuSamples
-from acino_fte.data_tools.sync import Stamps, Synchronisation, clock_of, from_motion, from_pivot, from_stamps
+from acino_fte.data_tools.sync import Stamps, Synchronisation, from_motion, from_pivot, from_stamps
 from acino_fte.data_tools.sync_events import Event, image_motion, knock, lag_of, led_step, region_brightness
 from acino_fte.data_tools.sync_grid import FrameGrid, frame_grid
 from acino_fte.data_tools.sync_match import match_video
@@ -25,46 +25,7 @@ _SEARCHED_S = 10.0  # of the inertial sensor about the frames, that a match must
 _MOTION_S = 40.0  # of video in which motion is measured
 _LEAST_MOTION_S = 1.5
 _EVEN = 0.25  # of a period: stamps whose steps vary less are those of a video that counts its frames
-_PIVOT = "FRAME=SECONDS, strike, strike:FRAME=SECONDS, led:X,Y,W,H=SECONDS or knock"
 _HAND = 0.25  # s: how far a strike may lie from what the user says of it; half a stride and more
-
-
-@dataclass(frozen=True)
-class PivotHint:
-    """What the user says of one event: a frame, a light's region, a knock, or a paw's strike."""
-
-    kind: Literal["frame", "led", "knock", "strike"]
-    frame: float | None = None
-    region: tuple[int, int, int, int] = (0, 0, 0, 0)
-    seconds: float = 0.0
-
-
-def pivot_hint(text: str | None) -> PivotHint | None:
-    """``FRAME=SECONDS``, ``strike[:FRAME=SECONDS]``, ``led:X,Y,W,H=SECONDS`` or ``knock``.
-
-    Seconds are from the lidar's first return; those of a strike are known roughly.
-
-    Raises
-    ------
-    InputError
-        The text is none of them.
-    """
-    if text is None:
-        return None
-    number = r"[-+]?\d*\.?\d+(?:[eE][-+]?\d+)?"
-    plain = text.strip().lower()
-    if plain == "knock":
-        return PivotHint("knock")
-    if plain == "strike":
-        return PivotHint("strike")
-    if match := re.fullmatch(rf"strike:\s*({number})\s*=\s*({number})s?", plain):
-        return PivotHint("strike", frame=float(match[1]), seconds=float(match[2]))
-    if match := re.fullmatch(rf"({number})\s*=\s*({number})s?", plain):
-        return PivotHint("frame", frame=float(match[1]), seconds=float(match[2]))
-    if match := re.fullmatch(rf"led:\s*(\d+),(\d+),(\d+),(\d+)\s*=\s*({number})s?", plain):
-        x, y, width, height = (int(match[i]) for i in range(1, 5))
-        return PivotHint("led", region=(x, y, width, height), seconds=float(match[5]))
-    raise InputError("The pivot cannot be read.", key="--pivot", expected=_PIVOT, found=text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +94,9 @@ def synchronise(inputs: Inputs) -> Timing:
     InputError
         Nothing tells them; the message says which hint would.
     """
-    lidar, notes = clock_of(inputs.lidar.stamps)
+    lidar, imu, notes = device_clocks(inputs.lidar, inputs.imu)
     received = inputs.lidar.received[0] if inputs.lidar.received else None
     origin = int(lidar.to_computer_ns(np.array([inputs.lidar.first_ns]), received)[0])
-    imu = _imu_clock(inputs, lidar)
     timing = Timing(_placeholder(origin), lidar, imu)
     stamped = inputs.camera is not None and bool(inputs.camera.received)
     if stamped:
@@ -153,16 +113,6 @@ def synchronise(inputs: Inputs) -> Timing:
 def _placeholder(origin: int) -> Synchronisation:
     nothing = np.zeros(1)
     return Synchronisation(nothing, origin, nothing.astype(np.int64), 1.0, (), nothing, "pivot")
-
-
-def _imu_clock(inputs: Inputs, lidar: DeviceClock) -> DeviceClock:
-    """That of the lidar where the inertial sensor is in it, and shows the same time."""
-    if inputs.imu is None:
-        return lidar
-    mine, other = np.array(inputs.imu.device), np.array(inputs.lidar.device)
-    if mine.min() <= other.max() and other.min() <= mine.max():
-        return lidar
-    return clock_of(inputs.imu.stamps)[0]
 
 
 def _by_stamps(inputs: Inputs, timing: Timing) -> tuple[Synchronisation, np.ndarray]:
@@ -300,7 +250,7 @@ def _by_event(inputs: Inputs, timing: Timing) -> Synchronisation:
         raise InputError(
             "Nothing tells when the frames were taken.",
             key="--pivot",
-            expected="stamps of the camera in the recording, or one event: " + _PIVOT,
+            expected="stamps of the camera in the recording, or one event: " + PIVOTS,
             found=missing,
             remedy="with keypoints of a running animal: --pivot strike. Or find an event that video and "
             "lidar both show, and give its frame and the lidar's time (seconds from its first return): "
@@ -331,7 +281,7 @@ def _strike(
     """The strike of a paw; where the user says roughly when it was, about that."""
     hint = inputs.pivot
     if inputs.animal is None or hint is None:
-        raise InputError("There is nothing that shows a paw's strike.", key="--pivot", expected=_PIVOT)
+        raise InputError("There is nothing that shows a paw's strike.", key="--pivot", expected=PIVOTS)
 
     def to_seconds(stamps: np.ndarray, received: int | None) -> np.ndarray:
         return timing.seconds(timing.lidar, stamps, received)
@@ -384,7 +334,7 @@ def _pivot_of(inputs: Inputs, timing: Timing, fps: float) -> tuple[tuple[float, 
     """Frame and time of the pivot, and its standard deviation, ms."""
     hint = inputs.pivot
     if hint is None:
-        raise InputError("There is no pivot.", key="--pivot", expected=_PIVOT)
+        raise InputError("There is no pivot.", key="--pivot", expected=PIVOTS)
     half_frame = 1e3 / np.sqrt(12) / fps
     if hint.kind == "frame":
         frame = hint.frame or 0.0

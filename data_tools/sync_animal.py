@@ -254,7 +254,7 @@ def _smooth_path(gain: np.ndarray, step: int) -> tuple[np.ndarray, float]:
 
 
 def _parts(outline: Outline, glimpses: Glimpses, lag: float) -> np.ndarray:
-    """Lags (4,) of the quarters of the video beyond that of the whole, s; 0 where no other one fits better."""
+    """Lags (4,) of the quarters of the video beyond that of the whole, s; 0 where none fits better."""
     period = float(np.median(np.diff(outline.time)))
     edges = np.linspace(0, len(outline.time), 5).astype(int)
     out = np.zeros(4)

@@ -17,10 +17,12 @@ from acino_fte.cameras import Camera
 from acino_fte.data_tools.bags_write import BagWriter
 from acino_fte.data_tools.calibration import read_cameras
 from acino_fte.data_tools.deeplabcut import read_deeplabcut, write_deeplabcut_csv
+from acino_fte.data_tools.import_clocks import device_clocks
 from acino_fte.data_tools.import_lidar import in_view
+from acino_fte.data_tools.import_pivot import pivot_hint
 from acino_fte.data_tools.import_recording import ImportOptions, import_recording
 from acino_fte.data_tools.import_scan import StreamScan
-from acino_fte.data_tools.import_sync import Inputs, pivot_hint, synchronise
+from acino_fte.data_tools.import_sync import Inputs, synchronise
 from acino_fte.data_tools.lidar_camera import LidarCamera, write_lidar_camera
 from acino_fte.data_tools.load import load_sequence
 from acino_fte.data_tools.lvx_packets import LvxDevice
@@ -505,3 +507,43 @@ def test_a_folder_of_something_else_is_left_alone(rig, tmp_path):
 def test_pivots_are_read(text, kind, seconds):
     hint = pivot_hint(text)
     assert (hint.kind, hint.seconds) == (kind, seconds)
+
+
+# --- clocks ---------------------------------------------------------------------------------------------
+
+
+def stamped(kind, at, late, drift=0.0, seed=0):
+    """Messages at s since frame 0, by a clock that drifts, received later by `late` + 1 ms on average."""
+    rng = np.random.default_rng([seed, len(kind)])
+    found = stream(kind, LIDAR_NS + np.rint((1 + drift) * at * 1e9).astype(np.int64))
+    found.received = (UNIX + np.rint((at + late + 1e-3 * rng.exponential(size=len(at))) * 1e9)).tolist()
+    return found
+
+
+def test_the_inertial_sensor_makes_the_lidars_clock_surer():
+    """Their clock is one: two seconds of ten messages of the lidar, and of two hundred of the other."""
+    probe = LIDAR_NS + np.arange(0, 2_000_000_000, 100_000_000)
+    errors, stated = [], []
+    for seed in range(8):
+        lidar = stamped("lidar", np.arange(0.1, 2, 0.1), LATE_LIDAR, -15e-6, seed)
+        imu = stamped("imu", np.arange(-4, 2, 0.005), LATE_LIDAR, -15e-6, seed)
+        row = []
+        for other in (None, imu):
+            clock, _, _ = device_clocks(lidar, other)
+            true = UNIX + round(1e9 * LATE_LIDAR) + (probe - LIDAR_NS) * (1 + 15e-6)
+            row.append(np.sqrt(np.mean((1e-6 * (clock.to_computer_ns(probe) - true)) ** 2)))
+        errors.append(row)
+        stated.append(clock.sd_ms)
+    alone, both = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert both < alone / 20
+    assert both < 2 * np.mean(stated) < 0.02
+
+
+def test_clocks_of_two_devices_stay_apart():
+    """Their stamps overlap by chance; what they show at one time differs by two seconds."""
+    lidar = stamped("lidar", np.arange(0.1, 20, 0.1), LATE_LIDAR)
+    imu = stamped("imu", np.arange(0, 20, 0.005), LATE_LIDAR)
+    imu.device = [one + 2_000_000_000 for one in imu.device]
+    clock, other, _ = device_clocks(lidar, imu)
+    at = np.array([LIDAR_NS + 5_000_000_000])
+    assert (clock.to_computer_ns(at) - other.to_computer_ns(at))[0] == pytest.approx(2e9, rel=1e-3)

@@ -5,7 +5,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from acino_fte.data_tools.import_sync import pivot_hint
+from acino_fte.data_tools.import_pivot import pivot_hint
 from acino_fte.data_tools.sync_animal import Glimpses, animal_lag
 from acino_fte.data_tools.sync_outline import nearest_link, outline_of
 from acino_fte.data_tools.sync_strike import paws_of, strikes_of
