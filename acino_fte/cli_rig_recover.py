@@ -116,17 +116,26 @@ def _show_one(found: Recovery) -> None:
     if found.whole and found.copy is None:
         stdout.print("Nothing is wrong with it, so no copy was made.")
     elif found.copy is not None:
-        saved = f"{_count(found.saved, 'message', 'messages')}, {_length(found):.1f} s"
+        units = {_unit(stream) for stream in found.streams}
+        unit = units.pop() if len(units) == 1 else "message"
+        saved = f"{_count(found.saved, unit, f'{unit}s')}, {_length(found):.1f} s"
         stdout.print(f"[bold green]saved[/] to {escape(str(found.copy))}: {saved}")
         stdout.print(f"report: {escape(str(found.report))}; the original was not touched")
 
 
 def _line(stream: SavedStream) -> str:
-    saved = f"{_count(stream.saved, 'message', 'messages')} saved ({stream.seconds:.1f} s)"
+    saved = f"{_count(stream.saved, _unit(stream), f'{_unit(stream)}s')} saved ({stream.seconds:.1f} s)"
     if not stream.lost:
         return f"{saved}, none known to be lost"
     about = "" if stream.exact else "about "
     return f"{saved}, {about}{stream.lost:,} lost ({stream.lost_seconds:.1f} s)"
+
+
+def _unit(stream: SavedStream) -> str:
+    """What a stream is made of."""
+    if "/" in stream.name:
+        return "message"
+    return "package" if stream.type.startswith("livox/") else "frame"
 
 
 def _length(found: Recovery) -> float:

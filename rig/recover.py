@@ -21,11 +21,11 @@ from acino_fte.data_tools.whole_text import write_text_whole
 from acino_fte.errors import InputError, did_you_mean
 from acino_fte.rig.recover_files import (
     Settings,
-    copy_whole,
+    copy_sound,
     count_of,
     file_kind,
     is_sound,
-    salvage_file,
+    rescue_file,
 )
 from acino_fte.rig.recover_types import Recovery, Salvaged
 
@@ -89,7 +89,7 @@ def recover(
         said(f"looking at {source.name}")
         return _one(source, wanted, settings, kind, said, _sound(source, settings, kind))
     except OSError as error:
-        raise _unwritable(error, source) from error
+        raise _unwritable(error, source, wanted or source.parent) from error
     except sqlite3.Error as error:
         raise InputError("The copy cannot be written.", file=source, found=str(error)) from error
 
@@ -176,10 +176,10 @@ def _into_file(
     copy = working / _suffixed(target, source).name
     target = target.parent / copy.name
     if sound is not None:
-        copy_whole(source, copy)
+        copy_sound(source, copy, settings)
         found = sound
     else:
-        found = salvage_file(source, copy, settings)
+        found = rescue_file(source, copy, settings)
         _check(source, copy, found)
     report = target.with_name(f"{target.name}.{REPORT}")
     recovery = _recovery(source, target, report, found)
@@ -198,7 +198,7 @@ def _into_folder(
         raise _nothing(source, found.notes)
     recovery = _recovery(source, target, target / REPORT, found)
     (working / REPORT).write_text(_text(recovery), encoding="utf-8")
-    for file in working.iterdir():
+    for file in filter(Path.is_file, working.iterdir()):
         _sync(file)
     _refuse(target, source)
     working.rename(target)
@@ -314,7 +314,7 @@ def _room(source: Path, target: Path) -> None:
         )
 
 
-def _unwritable(error: OSError, source: Path) -> InputError:
+def _unwritable(error: OSError, source: Path, place: Path) -> InputError:
     if error.errno == errno.EIO:
         return InputError(
             "The disk itself cannot be read.",
@@ -324,7 +324,7 @@ def _unwritable(error: OSError, source: Path) -> InputError:
         )
     return InputError(
         "The copy cannot be written; nothing of it was left.",
-        file=error.filename or source,
+        file=place,
         found=error.strerror or str(error),
         remedy="free some space, or name another place with --out",
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 from acino_fte.data_tools.bags_folder import files_of
 from acino_fte.errors import InputError
-from acino_fte.rig.recover_files import Settings, copy_whole, file_kind, is_sound, salvage_file
+from acino_fte.rig.recover_files import Settings, copy_sound, file_kind, is_sound, rescue_file, salvage_file
 from acino_fte.rig.recover_types import Salvaged, merged
 
 METADATA = "metadata.yaml"
@@ -63,11 +63,11 @@ def _part(path: Path, target: Path | None, settings: Settings) -> Salvaged:
     sound = is_sound(path, settings)
     if sound is not None:
         if target is not None:
-            copy_whole(path, target)
+            copy_sound(path, target, settings)
         return sound
-    found = salvage_file(path, target, settings)
     if target is None:
-        return found
+        return salvage_file(path, None, settings)
+    found = rescue_file(path, target, settings)
     if not found.saved:
         target.unlink(missing_ok=True)
         raise InputError("it holds no whole message", file=path)

@@ -136,17 +136,40 @@ def _video(path: Path, target: Path | None, settings: Settings) -> Salvaged:
         return salvage_mp4(path, target, settings.like, settings.fps)
 
 
+def rescue_file(path: Path, target: Path, settings: Settings) -> Salvaged:
+    """Rescue a file that :func:`is_sound` did not find sound."""
+    found = salvage_file(path, target, settings)
+    if not found.whole:
+        return found
+    note = "Every message is there, but the usual readers do not open the file: its index is damaged."
+    return replace(found, whole=False, notes=(*found.notes, note))
+
+
 def is_sound(path: Path, settings: Settings) -> Salvaged | None:
     """What a file holds that nothing is wrong with, also for the usual readers; None of a damaged one."""
     kind = file_kind(path)
-    if kind == "zstd" or not _seems_sound(path, kind):
+    if kind == "zstd":
+        with unpacked(path, None) as (inner, problem):
+            try:
+                return None if problem else is_sound(inner, settings)
+            except InputError:
+                return None
+    if not _seems_sound(path, kind):
         return None
     try:
         found = salvage_file(path, None, settings)
-        opens = found.whole and (kind not in ("ros1", "mcap") or count_of(path, kind) == found.saved)
     except InputError:
         return None
-    return found if opens else None
+    return found if found.whole and _opens(path, kind, found.saved) else None
+
+
+def _opens(path: Path, kind: FileKind, saved: int) -> bool:
+    """Whether the usual readers open a file, and see so many messages."""
+    if kind == "sqlite":
+        from acino_fte.rig.recover_sqlite import sqlite_is_sound
+
+        return sqlite_is_sound(path)
+    return kind not in ("ros1", "mcap") or count_of(path, kind) == saved
 
 
 def _seems_sound(path: Path, kind: FileKind) -> bool:
@@ -201,6 +224,9 @@ def unpacked(path: Path, room: Path | None) -> Iterator[tuple[Path, str]]:
         yield target, problem
 
 
-def copy_whole(path: Path, target: Path) -> None:
-    """Copy the bytes of a file."""
-    shutil.copyfile(path, target)
+def copy_sound(path: Path, target: Path, settings: Settings) -> None:
+    """Copy the bytes of a sound file; one that is compressed as a whole is unpacked."""
+    if file_kind(path) == "zstd":
+        salvage_file(path, target, settings)
+    else:
+        shutil.copyfile(path, target)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from acino_fte.data_tools.rig_recording import (
 )
 from acino_fte.data_tools.ros_messages import kind_of
 from acino_fte.errors import InputError
-from acino_fte.rig.recover_files import Settings, copy_whole, is_sound, salvage_file
+from acino_fte.rig.recover_files import Settings, copy_sound, is_sound, rescue_file, salvage_file
 from acino_fte.rig.recover_types import Salvaged, SavedStream, merged
 
 _MESSAGES = re.compile(r"messages-(\d+)\.mcap")
@@ -123,18 +124,20 @@ def _file(folder: _Folder, path: Path, target: Path | None, settings: Settings) 
     """Rescue one file of the folder, or copy it."""
     place = target / path.name if target is not None else None
     messages, video = _MESSAGES.fullmatch(path.name), _VIDEO.fullmatch(path.name)
+    if path.is_dir() and place is not None and not path.name.startswith("."):
+        shutil.copytree(path, place)
     if not path.is_file() or path.name == MANIFEST:
         return
     if not messages and not video:
         if place is not None and not path.name.startswith("."):
-            copy_whole(path, place)
+            shutil.copyfile(path, place)
         return
     sound, found = None, None
     try:
         sound = is_sound(path, settings)
         if sound is not None and place is not None:
-            copy_whole(path, place)
-        found = sound or salvage_file(path, place, settings)
+            copy_sound(path, place, settings)
+        found = sound or _rescued(path, place, settings)
     except InputError as error:
         folder.wrong(f"{path.name}: nothing can be saved ({error.problem})")
     if found is None or (sound is None and not found.saved):
@@ -150,6 +153,11 @@ def _file(folder: _Folder, path: Path, target: Path | None, settings: Settings) 
     index = int(video[2] if video else messages[1] if messages else 0)
     size = (place or path).stat().st_size
     folder.parts.append(_Part(path.name, camera, index, found, size))
+
+
+def _rescued(path: Path, place: Path | None, settings: Settings) -> Salvaged:
+    """What a damaged segment gives; without a place only counted."""
+    return rescue_file(path, place, settings) if place else salvage_file(path, None, settings)
 
 
 def _missing(folder: _Folder) -> None:

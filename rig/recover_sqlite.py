@@ -152,6 +152,16 @@ def salvage_sqlite(source: Path, target: Path | None) -> Salvaged:
     )
 
 
+def sqlite_is_sound(source: Path) -> bool:
+    """Whether SQLite finds all pages in order, also those that no message needs."""
+    uri = source.resolve().as_uri() + "?mode=ro&immutable=1"
+    try:
+        with closing(sqlite3.connect(uri, uri=True)) as database:
+            return bool(database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",))
+    except _BROKEN:
+        return False
+
+
 def _count(walk: _Rows, tally: Tally, losses: Noted) -> None:
     for message in walk.messages(payloads=False):
         tally.add(message.channel.topic, message.channel.type, message.received_ns, losses.n_notes)

@@ -12,7 +12,7 @@ from acino_fte.rig.recover import recover
 pytest.importorskip("rosbags")
 pytest.importorskip("mcap")
 
-EVERY = 8  # of the 200 cuts; benchmarks/bench_recover.py makes them all
+EVERY = 4  # of the 200 cuts; benchmarks/bench_recover.py makes them all
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def made(tmp_path_factory):
 
 @pytest.mark.parametrize("form", [*BAGS, *LVXS])
 def test_everything_before_a_cut_is_saved(made, form, tmp_path):
-    """At every 8th of 200 places: at least the whole messages before it, byte for byte and in order; of a
+    """At every 4th of 200 places: at least the whole messages before it, byte for byte and in order; of a
     cut chunk what its decompressor still gives; never a message that was not written."""
     path, needed = made[form]
     data, everything = path.read_bytes(), read_standard(path, form)

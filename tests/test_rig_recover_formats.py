@@ -94,6 +94,52 @@ def test_lost_messages_are_told_by_time_where_no_index_tells_them(tmp_path):
     assert found.lost >= sum(s.lost for s in found.streams)
 
 
+@pytest.mark.parametrize("form", ["ros1-lz4", "mcap-zstd", "db3"])
+def test_messages_whose_topic_is_lost_are_kept(form, tmp_path):
+    """The one place that names topics is damaged, and the file is cut: the bytes are kept, by number."""
+    path, _ = make(tmp_path, form)
+    data = bytearray(path.read_bytes())
+    if form == "db3":
+        data[3 * 4096 : 4 * 4096] = bytes(4096)  # the table of topics
+    if form == "mcap-zstd":
+        data[200:4000] = bytes(3800)
+    if form == "ros1-lz4":  # the first chunk has the connections
+        first = data.index(b"compression=lz4")
+        data[first + 40 : first + 2500] = bytes(2460)
+    path.write_bytes(data if form == "db3" else data[: len(data) * 3 // 5])
+    found = recover(path)
+    saved = read_standard(found.copy, form)
+    assert len(saved) > 15 and saved == [p for p in PAYLOADS if p in set(saved)]
+    names = {stream.name for stream in found.streams if stream.saved}
+    assert names and all(name.startswith("/recovered/") for name in names)
+    assert any("topic and type are lost" in n or "name and type are lost" in n for n in found.notes)
+
+
+def test_a_page_that_no_message_needs(tmp_path):
+    """Other programs refuse such a file: it is damaged too, though all messages can be read."""
+    path, _ = make(tmp_path, "db3")
+    data = bytearray(path.read_bytes())
+    data[6 * 4096 : 7 * 4096] = bytes(4096)  # of the index of times
+    path.write_bytes(data)
+    found = recover(path)
+    assert not found.whole and found.saved == len(PAYLOADS) and found.lost == 0
+    assert read_standard(found.copy, "db3") == PAYLOADS
+
+
+def test_a_damaged_definition_does_not_make_the_copy_unreadable(tmp_path):
+    """Other programs refuse a bag whose definitions and their sums do not fit: they are made anew."""
+    path, _ = make(tmp_path, "ros1-none")
+    data = bytearray(path.read_bytes())
+    at = 0
+    while (at := data.find(b"layout        # specification", at + 1)) >= 0 or at == 0:
+        data[at : at + 4] = b"\x00\xffz{"
+    while (at := data.find(b"MultiArrayLayout layout", at + 1)) >= 0:
+        data[at : at + 6] = b"\x00\xffz{}}"
+    path.write_bytes(data[:-3000])
+    found = recover(path)
+    assert read_standard(found.copy, "ros1") == PAYLOADS[: found.saved] and found.saved > 40
+
+
 def test_a_real_type_reads_on(tmp_path):
     """A cut bag of ROS 1 with messages that the readers know: its copy is imported as any other."""
     sample = ImuSamples(np.array([START]), np.zeros((1, 3)), np.full((1, 3), 5.0))
@@ -198,6 +244,8 @@ def test_a_bag_that_was_compressed_as_a_whole(tmp_path):
     pack, blocks = zstandard.ZstdCompressor().compressobj(), b""
     for at in range(0, len(data), 4096):
         blocks += pack.compress(data[at : at + 4096]) + pack.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
+    packed.write_bytes(blocks + pack.flush())
+    assert recover(packed).whole and recover(packed, tmp_path / "plain").copy.read_bytes()[:6] == b"SQLite"
     packed.write_bytes(blocks[: len(blocks) // 2])
     found = recover(packed)
     assert found.copy == tmp_path / "a_0-recovered.db3"
