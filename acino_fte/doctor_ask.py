@@ -18,22 +18,17 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-PATIENCE = 10.0  # s for one probe; importing a large package from a cold, slow card takes several
+PATIENCE = 20.0  # s for one probe; a large package on a cold, slow card, or a busy computer, takes several
 WORKERS = (  # side by side; those that import the same in one
     ("import:numpy", "import:scipy", "ipopt", "threads", "explicit", "import:pyomo", "import:casadi"),
-    ("import:pandas", "import:xarray", "import:h5netcdf", "import:matplotlib", "import:pypcd4", "import:cv2")
-    + ("import:pycolmap",),
     (
-        "serial",
-        "gpio",
-        "devices",
-        "codecs",
-        "import:nicegui",
-        "import:rosbags.highlevel",
-        "import:mcap",
-        "import:av",
-    )
-    + ("import:serial", "import:gpiozero", "import:gpiod"),
+        *("devices", "import:pandas", "import:xarray", "import:h5netcdf", "import:matplotlib"),
+        *("import:pypcd4", "import:cv2", "import:pycolmap"),
+    ),
+    (
+        *("serial", "gpio", "codecs", "import:nicegui", "import:rosbags.highlevel", "import:mcap"),
+        *("import:av", "import:serial", "import:gpiozero", "import:gpiod"),
+    ),
 )
 _START = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[1]); from acino_fte.doctor_probe import main; main()"

@@ -79,7 +79,7 @@ CARD = [
             (TASK, "Evening", "charge; make room on the disk; let the computer set its clock", ""),
             (TASK, "Distance", "what are pictures worth there, and with which lens?", "acino-fte rig plan"),
             (TASK, "Car", "plugs in, lens cap off. Wait for “rig: ready”", "acino-fte doctor --for rig"),
-            (TASK, "Lens", "choose the zoom and keep it; focus where the animal will be", ""),
+            (TASK, "Lens", "zoom and focus, in a second window that stays open", "acino-fte rig drive"),
             (TASK, "Trial", "twelve seconds", "acino-fte rig record --minutes 0.2"),
             (TASK, "", "and look at them; FOLDER is the name that it gave", "acino-fte rig check FOLDER"),
         ],

@@ -15,9 +15,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from acino_fte import (
+    cli_doctor,
     doctor,
     doctor_ask,
     doctor_devices,
@@ -26,7 +28,6 @@ from acino_fte import (
     doctor_probe,
     doctor_storage,
 )
-from acino_fte.cli import app
 from acino_fte.doctor import Finding, Surroundings, all_checks, examine, looked, ready
 from acino_fte.doctor_ask import Answer, asked
 
@@ -68,8 +69,12 @@ def well(monkeypatch):
     return use
 
 
+alone = typer.Typer()  # the whole program is built anew for every call, which takes longer than the checks
+alone.command()(cli_doctor.doctor)
+
+
 def run(*words: str):
-    return CliRunner(env={"COLUMNS": "300"}).invoke(app, ["doctor", *words])
+    return CliRunner(env={"COLUMNS": "300"}).invoke(alone, words)
 
 
 # The command
