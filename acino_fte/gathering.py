@@ -268,7 +268,8 @@ class _Sums:
         items, place = np.unique(other.items, return_inverse=True)
         total = np.zeros((node.scatter.shape[0], 3, len(items)))
         cells = node.scatter.tocoo()
-        np.add.at(total, (cells.row, slice(None), place[cells.col]), cells.data[:, None] * values[cells.col])
+        where = (cells.row[:, None], np.arange(3), place[cells.col][:, None])
+        np.add.at(total, where, cells.data[:, None] * values[cells.col])
         self._keep(tuple(items.tolist()), total)
 
     def _keep(self, key: tuple[int, ...], total: np.ndarray) -> None:

@@ -10,7 +10,7 @@ from acino_fte.kinematics import load_kinematics
 from acino_fte.problem import FTEOptions
 from acino_fte.rig_options import RigOptions
 from acino_fte.simulate_rig import rig_to_sequence, simulate_rig
-from acino_fte.single_view import animal_depth, depth_from_size, surface_ratio
+from acino_fte.single_view_depth import animal_depth, depth_from_size, smooth_track, surface_ratio
 
 
 def recording(**options):
@@ -41,6 +41,27 @@ def test_the_lidar_tells_the_depth_to_a_body(options):
     sequence, kinematics, simulation = recording(**options)
     found = animal_depth(sequence, kinematics, pixels_of(sequence, kinematics))
     np.testing.assert_allclose(found, true_depth(simulation), atol=0.5)
+
+
+def test_an_animal_that_runs_at_the_camera_has_a_steady_depth():
+    """Its size is told by little, and changes with every stride."""
+    sequence, kinematics, simulation = recording(angle=85.0, n_frames=120)
+    found = animal_depth(sequence, kinematics, pixels_of(sequence, kinematics))
+    error = found - true_depth(simulation)
+    assert np.abs(error).max() < 0.7
+    assert error.std() < 0.3
+
+
+def test_a_smooth_track_keeps_lines_and_drops_what_is_wild():
+    rng = np.random.default_rng(0)
+    place = np.sort(rng.uniform(0, 100, 300))
+    values = 3.0 + 0.1 * place
+    at = np.linspace(0, 100, 21)
+    np.testing.assert_allclose(smooth_track(place, values, at, 5.0), 3.0 + 0.1 * at, atol=0.05)
+    values[::6] += 40.0
+    np.testing.assert_allclose(smooth_track(place, values, at, 5.0), 3.0 + 0.1 * at, atol=0.1)
+    far = smooth_track(place[:3], values[1:4], np.array([1e4]), 5.0)  # nothing near: the nearest
+    np.testing.assert_allclose(far, np.median(values[1:4]))
 
 
 def test_the_path_among_returns_is_the_slow_one_in_front():
