@@ -86,6 +86,9 @@ def salvage_ecal(source: Path, target: Path | None, like: Path | None = None) ->
     try:
         with _entries(source, notes, losses, target.parent) as entries:
             for number, data in entries:
+                if number in places:
+                    losses.note(f"there are two messages {number}", 1)
+                    continue
                 row = known.get(number)
                 channel = row[0] if row else sorter.channel(data)
                 stamp = row[1] if row else sorter.stamp_us(data, n)
@@ -134,6 +137,9 @@ def _open(path: Path, mode: str) -> Any:
 
 def _close(out: Any, channels: list[_Found]) -> None:
     """Write the tables, as eCAL does when it closes a recording."""
+    for channel in channels:
+        while quote(channel.name, safe="") in out or sum(c.name == channel.name for c in channels) > 1:
+            channel.name += "_"
     out.attrs["Version"] = np.bytes_("5.0")
     out.attrs["Channels"] = np.bytes_(",".join(channel.name for channel in channels))
     for channel in channels:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
+import struct
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -92,6 +92,7 @@ def salvage_mcap(source: Path, target: Path | None) -> Salvaged:
 def _load_mcap() -> Any:
     try:
         import mcap.data_stream
+        import mcap.exceptions
         import mcap.records
         import mcap.writer
     except ImportError as error:
@@ -133,19 +134,21 @@ class _McapWriter:
         )
 
     def _channel(self, writer: Any, number: int) -> int:
-        if number not in self._walk.channel_bytes:
-            return int(writer.register_channel(self._walk.channels[number].topic, "", 0))
-        channel = _record(self._mcap, "Channel", self._walk.channel_bytes[number])
-        schema = 0
-        if channel.schema_id in self._walk.schema_bytes:
-            schema = self._schema(writer, channel.schema_id)
+        channel = _record(self._mcap, "Channel", self._walk.channel_bytes.get(number, b""))
+        if channel is None:  # lost, or damaged
+            known = self._walk.channels[number]
+            return int(writer.register_channel(known.topic, known.layout.name if known.layout else "", 0))
+        schema = self._schema(writer, channel.schema_id)
         return int(
             writer.register_channel(channel.topic, channel.message_encoding, schema, dict(channel.metadata))
         )
 
     def _schema(self, writer: Any, number: int) -> int:
+        """Number of a schema in the copy; 0 where it is lost."""
         if number not in self._schemas:
-            schema = _record(self._mcap, "Schema", self._walk.schema_bytes[number])
+            schema = _record(self._mcap, "Schema", self._walk.schema_bytes.get(number, b""))
+            if schema is None:
+                return 0
             self._schemas[number] = writer.register_schema(schema.name, schema.encoding, schema.data)
         return self._schemas[number]
 
@@ -157,19 +160,21 @@ class _McapWriter:
         writer.finish()
 
 
-def _record(mcap: Any, kind: str, content: bytes) -> Any:
-    """A record of the package ``mcap`` from its bytes."""
+def _record(mcap: Any, kind: str, content: bytes) -> Any | None:
+    """A record of the package ``mcap`` from its bytes; None where they are none."""
     stream = mcap.data_stream.ReadDataStream(io.BytesIO(content))
-    cls = getattr(mcap.records, kind)
-    return cls.read(stream, len(content)) if kind == "Chunk" else cls.read(stream)
+    try:
+        return getattr(mcap.records, kind).read(stream)
+    except (ValueError, KeyError, IndexError, OverflowError, struct.error, mcap.exceptions.McapError):
+        return None
 
 
 def _topic(walk: _Mcap, number: int) -> dict[str, str]:
     """What metadata.yaml of ROS 2 says of a topic."""
     channel = walk.channels[number]
     out = {"name": channel.topic, "type": channel.type, "serialization_format": "cdr"}
-    with suppress(KeyError, ValueError, IndexError):
-        record = _record(_load_mcap(), "Channel", walk.channel_bytes[number])
+    record = _record(_load_mcap(), "Channel", walk.channel_bytes.get(number, b""))
+    if record is not None:
         out["serialization_format"] = record.message_encoding
         out["offered_qos_profiles"] = record.metadata.get("offered_qos_profiles", "")
         out["type_description_hash"] = record.metadata.get("topic_type_hash", "")
@@ -208,11 +213,9 @@ def _extras(source: Path) -> Iterator[Callable[[Any], None]]:
     for op, file, length in _outer(source):
         if op not in (_ATTACHMENT, _METADATA):
             continue
-        try:
-            record = _record(mcap, "Attachment" if op == _ATTACHMENT else "Metadata", file.read(length))
-        except (ValueError, KeyError, IndexError, OverflowError):
-            continue
-        yield partial(_add_attachment if op == _ATTACHMENT else _add_metadata, record)
+        record = _record(mcap, "Attachment" if op == _ATTACHMENT else "Metadata", file.read(length))
+        if record is not None:
+            yield partial(_add_attachment if op == _ATTACHMENT else _add_metadata, record)
 
 
 def _add_attachment(record: Any, writer: Any) -> None:

@@ -89,8 +89,8 @@ def _end(file: BinaryIO) -> int:
 
 def _salvaged(av: Any, container: Any, source: Path, target: Path | None) -> Salvaged:
     with container:
-        if not container.streams.video:
-            raise InputError("The file has no pictures.", file=source, expected="a video stream")
+        if not container.streams.video or container.streams.video[0].codec_context is None:
+            raise NoIndex("its head tells of no pictures")
         form = _FORMS.get(container.format.name, container.format.name.split(",")[0])
         notes, damaged = _state(container, source, form)
         if target is None:
@@ -122,12 +122,19 @@ class _Count:
         self.first: int | None = None
         self.last: int | None = None
 
-    def add(self, packet: Any) -> None:
-        stamp = packet.pts if packet.pts is not None else packet.dts
+    def add(self, stamp: int | None) -> None:
+        """Count a frame of this time."""
         if stamp is not None:
             self.first = stamp if self.first is None else min(self.first, stamp)
             self.last = stamp if self.last is None else max(self.last, stamp)
         self.n += 1
+
+    def problem(self, note: str, packet: Any, notes: list[str]) -> None:
+        """A frame is lost."""
+        self.problems += 1
+        self.bytes_lost += packet.size
+        if self.problems <= _MOST_PROBLEMS:
+            notes.append(note)
 
 
 def _copied(av: Any, container: Any, out: Any, notes: list[str]) -> _Count:
@@ -146,15 +153,24 @@ def _copied(av: Any, container: Any, out: Any, notes: list[str]) -> _Count:
         if packet.size == 0:
             continue
         if packet.is_corrupt:
-            count.problems += 1
-            count.bytes_lost += packet.size
-            if count.problems <= _MOST_PROBLEMS:
-                notes.append(f"After frame {count.n - 1} a frame of {packet.size} bytes is not whole.")
+            count.problem(
+                f"After frame {count.n - 1} a frame of {packet.size} bytes is not whole.", packet, notes
+            )
             continue
-        if packet.stream.index == video.index:
-            count.add(packet)
-        if out is not None:
-            out(packet)
+        pictures = packet.stream.index == video.index
+        stamp = packet.pts if packet.pts is not None else packet.dts
+        try:
+            if out is not None:
+                out(packet)
+        except av.error.FFmpegError as error:
+            if isinstance(error, OSError):  # of the disk
+                raise
+            count.problem(
+                f"After frame {count.n - 1} a frame does not fit the others ({error}).", packet, notes
+            )
+            continue
+        if pictures:
+            count.add(stamp)
 
 
 def _remuxed(av: Any, container: Any, target: Path, form: str, notes: list[str]) -> _Count:
@@ -176,7 +192,6 @@ def _remuxed(av: Any, container: Any, target: Path, form: str, notes: list[str])
                     packet.stream = streams[packet.stream.index]
                     out.mux_one(packet)
 
-            # the count sees the packet before it changes its stream
             return _copied(av, container, write, notes)
     except (av.error.FFmpegError, ValueError) as error:
         raise InputError("The copy of the video cannot be written.", file=target, found=str(error)) from error
