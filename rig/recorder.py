@@ -67,7 +67,7 @@ class Recorder:
         self.log = EventLog()
         self.reason = self.unwritten = ""
         self._stop = False  # a plain value: a signal may come while any lock is held
-        self._ended, self._lock = Flag(), Lock()
+        self._ended, self._lock, self._writing = Flag(), Lock(), Lock()
         self._segments: dict[str, Segment] = {}
         self._open: list[OpenSegment] = []
         self._readers: list[Reader] = []
@@ -291,9 +291,12 @@ class Recorder:
             self._writers[name].turn_to(segment)
 
     def _tell_segment(self, segment: Segment) -> None:
+        """Note a file. One that is about to begin stands in the manifest before it is there."""
         with self._lock:
             self._segments[segment.file] = segment
-        self.log.changed = True
+        self.log.touch()
+        if not segment.closed:
+            self._write("recording")
 
     def _keep_syncing(self) -> None:
         n = 0
@@ -331,12 +334,13 @@ class Recorder:
 
     def _write(self, state: State, ended_ns: int | None = None) -> Manifest:
         """Write the manifest."""
-        manifest = self.manifest(state, ended_ns)
-        try:
-            write_manifest(self.folder, manifest)
-        except InputError as error:  # the one before is still there
-            self.unwritten = f"the manifest cannot be written ({error.found})"
-            self.stop(self.unwritten)
+        with self._writing:
+            manifest = self.manifest(state, ended_ns)
+            try:
+                write_manifest(self.folder, manifest)
+            except InputError as error:  # the one before is still there
+                self.unwritten = f"the manifest cannot be written ({error.found})"
+                self.stop(self.unwritten)
         return manifest
 
     def manifest(self, state: State, ended_ns: int | None = None) -> Manifest:

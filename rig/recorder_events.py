@@ -48,6 +48,11 @@ class EventLog:
         with self._lock:
             return tuple(sorted(self._events, key=lambda event: event.time_ns))
 
+    def touch(self) -> None:
+        """Something else changed that the manifest tells."""
+        with self._lock:
+            self.changed = True
+
     def taken(self) -> bool:
         """Whether anything changed since this was last asked."""
         with self._lock:

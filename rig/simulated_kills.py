@@ -170,10 +170,8 @@ def _inconsistent(folder: Path, manifest: Manifest) -> Iterator[str]:
     from acino_fte.data_tools.video import VideoReader
 
     named = {segment.file: segment for segment in manifest.segments}
-    newest = max((segment.index for segment in manifest.segments), default=0)
     for path in [*folder.glob("*.mcap"), *folder.glob("*.mkv")]:
-        index = int(path.stem.rpartition("-")[2])
-        if path.name not in named and index <= newest - 1:
+        if path.name not in named:
             yield f"{path.name} is not in the manifest"
     for segment in manifest.segments:
         path = folder / segment.file

@@ -37,16 +37,17 @@ class OpenSegment:
         self._writers, self._tell, self._lock = set(writers), tell, Lock()
         self._videos: dict[str, VideoFile] = {}
         self.closed = False
-        self.messages = MessageFile(folder / f"messages-{index:04d}.mcap")
-        tell(Segment(self.messages.path.name, "messages", index))
+        path = folder / f"messages-{index:04d}.mcap"
+        tell(Segment(path.name, "messages", index))
+        self.messages = MessageFile(path)
 
     def open_video(self, camera: str, part: CameraPart, codec: str, pixels: np.ndarray) -> VideoFile:
         """Begin the video of a camera."""
         path = self._folder / f"{camera}-{self.index:04d}.mkv"
+        self._tell(Segment(path.name, "video", self.index))
         video = VideoFile(path, camera, part, codec, self._started, pixels)
         with self._lock:
             self._videos[camera] = video
-        self._tell(Segment(path.name, "video", self.index))
         return video
 
     def close_video(self, video: VideoFile) -> None:
