@@ -79,36 +79,15 @@ def salvage_ecal(source: Path, target: Path | None, like: Path | None = None) ->
     if target is None:
         return _inspected(source)
     losses, tally, notes = Noted(), Tally(), list[str]()
-    known = _tables(source)
-    sorter = _Sorter(like, notes)
-    out = _open(target, "w")
-    n, places = 0, set[int]()
-    try:
+    known, sorter = _tables(source), _Sorter(like)
+    with _open(target, "w") as out:
         with _entries(source, notes, losses, target.parent) as entries:
-            for number, data in entries:
-                if number in places:
-                    losses.note(f"there are two messages {number}", 1)
-                    continue
-                row = known.get(number)
-                channel = row[0] if row else sorter.channel(data)
-                stamp = row[1] if row else sorter.stamp_us(data, n)
-                sent = row[2] if row else stamp
-                out.create_dataset(str(number), data=np.frombuffer(data, np.uint8))
-                channel.rows.append((stamp, number, len(channel.rows), sent, 0))
-                tally.add(_topic(channel.name), _type(channel.type), stamp * 1000, losses.n_notes)
-                losses.read += 1
-                n += 1
-                places.add(number)
-        channels = [
-            c for c in {id(c): c for c in [*(r[0] for r in known.values()), *sorter.found]}.values() if c.rows
-        ]
-        _close(out, channels)
-    finally:
-        out.close()
-    if sorter.found:
-        notes += sorter.sentences()
-    if places:
-        losses.lost += max(places) - min(places) + 1 - len(places)
+            numbers = _copied(entries, out, known, sorter, tally, losses)
+        every = {id(channel): channel for channel, *_ in known.values()}
+        _close(out, [channel for channel in (*every.values(), *sorter.found) if channel.rows])
+    notes += sorter.sentences()
+    if numbers and (span := max(numbers) - min(numbers) + 1) < 10 * len(numbers) + 1000:
+        losses.lost += span - len(numbers)
     streams = tally.streams()
     damage = losses.damage()
     return Salvaged(
@@ -119,6 +98,32 @@ def salvage_ecal(source: Path, target: Path | None, like: Path | None = None) ->
         damage.bytes_lost,
         (*notes, *(sentence(place) for place in damage.places)),
     )
+
+
+def _copied(
+    entries: Iterator[tuple[int, bytes]],
+    out: Any,
+    known: dict[int, tuple[_Found, int, int]],
+    sorter: _Sorter,
+    tally: Tally,
+    losses: Noted,
+) -> set[int]:
+    """Write every message, and put it into the table of its channel; returns their numbers."""
+    numbers = set[int]()
+    for number, data in entries:
+        if number in numbers:
+            losses.note(f"there are two messages {number}", 1)
+            continue
+        row = known.get(number)
+        channel = row[0] if row else sorter.channel(data)
+        stamp = row[1] if row else sorter.stamp_us(data)
+        sent = row[2] if row else stamp
+        out.create_dataset(str(number), data=np.frombuffer(data, np.uint8))
+        channel.rows.append((stamp, number, len(channel.rows), sent, 0))
+        tally.add(_topic(channel.name), _type(channel.type), stamp * 1000, losses.n_notes)
+        losses.read += 1
+        numbers.add(number)
+    return numbers
 
 
 def _inspected(source: Path) -> Salvaged:
@@ -276,12 +281,11 @@ def _description(data: Any) -> bytes:
 class _Sorter:
     """Tells the channel of a message by its content."""
 
-    def __init__(self, like: Path | None, notes: list[str]) -> None:
+    def __init__(self, like: Path | None) -> None:
         self.found: list[_Found] = []
         self._by_key: dict[tuple[str, str], _Found] = {}
         self._last = 0
         self._named = _channels_of(like) if like is not None else {}
-        self._like = like
         self._types = [*dict.fromkeys([*(kind for kind, _ in self._named), *_TYPES])]
 
     def channel(self, data: bytes) -> _Found:
@@ -293,7 +297,7 @@ class _Sorter:
             self.found.append(found)
         return self._by_key[key]
 
-    def stamp_us(self, data: bytes, n: int) -> int:
+    def stamp_us(self, data: bytes) -> int:
         """The time of the message's header, µs; that of the message before where it has none."""
         stamp = self._decoded(data)[2]
         self._last = stamp // 1000 if stamp is not None else self._last
@@ -324,7 +328,9 @@ class _Sorter:
         return "", "", None
 
     def sentences(self) -> list[str]:
-        """What was made out."""
+        """What was made out; nothing where the tables told all."""
+        if not self.found:
+            return []
         out = []
         for found in self.found:
             n = len(found.rows)
@@ -348,6 +354,10 @@ class _Sorter:
 def _channels_of(like: Path) -> dict[tuple[str, str], _Found]:
     """Channels of a sound recording by type and frame."""
     out: dict[tuple[str, str], _Found] = {}
+    if not ecal_is_whole(like):
+        raise InputError(
+            "The sound recording cannot be used.", file=like, expected="a recording of eCAL with its tables"
+        )
     with _open(like, "r") as file:
         for key in file:
             data = file[key]

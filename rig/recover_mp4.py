@@ -94,6 +94,11 @@ def salvage_mp4(source: Path, target: Path, like: Path | None = None, fps: float
         f"How they are encoded was taken from {parameters.origin}.",
         said,
     ]
+    return _account(written, skipped, lost, rate, notes)
+
+
+def _account(written: int, skipped: int, lost: list[int], rate: Fraction, notes: list[str]) -> Salvaged:
+    """What was saved, at this rate; pictures without the key frame before them are lost."""
     if skipped:
         notes.append(f"{skipped} pictures before the first key frame cannot be shown and were left out.")
     if lost:

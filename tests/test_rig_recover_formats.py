@@ -350,6 +350,8 @@ def test_ecal_without_tables(tmp_path):
     named = recover(bad, tmp_path / "named.hdf5", like=good)
     assert {"/imu": 14, "/cam/info": 13}.items() <= {s.name: s.saved for s in named.streams}.items()
     assert recover(named.copy).whole and recover(good).whole
+    with pytest.raises(InputError, match="sound recording cannot be used"):
+        recover(bad, tmp_path / "other.hdf5", like=bad)
 
 
 def test_ecal_that_hdf5_does_not_open(tmp_path):
