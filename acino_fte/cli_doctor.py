@@ -45,7 +45,7 @@ def doctor(
 ) -> None:
     """Look whether this computer has what is needed, and say what to do where it has not.
 
-    Takes about two seconds, and changes nothing. Leaves with 0 when all that matters works, 1 otherwise.
+    Takes a few seconds, and changes nothing. Leaves with 0 when all that matters works, 1 otherwise.
 
     Example: acino-fte doctor --for rig --path /media/recordings
     """

@@ -123,7 +123,7 @@ def all_checks() -> tuple[Check, ...]:
 
 
 def examine(path: Path, root: Path = Path("/"), checks: Sequence[Check] | None = None) -> Iterator[Finding]:
-    """Look at everything, about two seconds; findings come as they are found.
+    """Look at everything, which takes a few seconds; findings come as they are found.
 
     Parameters
     ----------
