@@ -10,6 +10,7 @@ _NEAR_NS = 750_000_000  # between an event and what it explains
 _JUMP_S = 0.1  # of the size of a jump
 _LENGTH_S = 0.35  # between two lengths of a silence
 _ENDS_PERIODS, _ENDS_S = 5.0, 0.3  # silence at the start or the end that is told
+_CUT_NS = 2_000_000_000  # before the end of a recording that was cut short: what was still on its way
 _LOSSES = ("stall", "unplugged", "dropped", "lost", "error")
 
 
@@ -57,8 +58,11 @@ def compare_events(found: Findings) -> list[str]:
     said: list[str] = []
     for event in manifest.events:
         said += _event(found, event)
-    origin = found.span[0]
+    origin, end = found.span
     for account in found.streams.values():
+        for gap in account.gaps:
+            if manifest.state != "closed" and gap.start_ns > end - _CUT_NS and not gap.explained:
+                gap.explained = "the recording was cut short"
         said += [
             f"{account.name}: {gap.lost} are missing for {gap.seconds:.2f} s from "
             f"{_at(gap.start_ns, origin)} on, and no event tells why"

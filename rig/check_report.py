@@ -38,6 +38,8 @@ th, td { padding: .15rem .5rem; text-align: left; border-bottom: 1px solid #eee;
   overflow-wrap: anywhere; }
 img { max-width: 100%; display: block; } .soft { color: #666; font-size: .85rem; }
 ul { margin: .3rem 0; padding-left: 1.2rem; }
+table.verdict td:nth-child(-n+3) { white-space: nowrap; overflow-wrap: normal; }
+table.verdict td:nth-child(5) { overflow-wrap: normal; }
 tr.fail td:first-child { color: #a33600; font-weight: 700; }
 tr.warn td:first-child { color: #8a5a00; font-weight: 700; }
 tr.pass td:first-child { color: #00674c; }
@@ -172,10 +174,11 @@ def summary(check: Check) -> str:
     lost = sum(stream.lost for stream in filled)
     n_bad = sum(requirement.verdict == "fail" for requirement in check.requirements)
     n_odd = sum(requirement.verdict == "warn" for requirement in check.requirements)
-    told = [text for n, text in ((n_bad, f"{n_bad} failed"), (n_odd, f"{n_odd} warnings")) if n]
-    return (
-        f"{WORDS[check.verdict]}: {(end - begin) * 1e-9:.1f} s{when}, {len(filled)} streams, "
-        f"{lost} lost" + (f"; {', '.join(told)}" if told else "")
+    odd = "1 warning" if n_odd == 1 else f"{n_odd} warnings"
+    told = [text for n, text in ((n_bad, f"{n_bad} failed"), (n_odd, odd)) if n]
+    streams = "1 stream" if len(filled) == 1 else f"{len(filled)} streams"
+    return f"{WORDS[check.verdict]}: {(end - begin) * 1e-9:.1f} s{when}, {streams}, {lost} lost" + (
+        f"; {', '.join(told)}" if told else ""
     )
 
 
@@ -245,7 +248,7 @@ def _requirements(requirements: tuple[Requirement, ...]) -> str:
         for one in order
     )
     head = "".join(f"<th>{t}</th>" for t in ("", "what", "of", "found", "limit", "what to do"))
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    return f"<table class='verdict'><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
 
 
 def _listed(title: str, texts: tuple[str, ...] | list[str]) -> list[str]:

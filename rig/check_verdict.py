@@ -204,7 +204,7 @@ def _clocks(found: Findings, streams: list[StreamAccount]) -> list[Requirement]:
             verdict = "fail" if found.base == "device" else "warn"
             out.append(
                 Requirement(
-                    "clock jumps", stream.name, verdict, f"{len(own)}: {sizes}", "none",
+                    "clock jumps", stream.name, verdict, f"{sizes} ({len(own)} in all)", "none",
                     "nothing tells the time across the jump: use the parts before and after apart"
                     if verdict == "fail" else "the device began anew; the import takes the pieces apart",
                 )
@@ -216,7 +216,7 @@ def _clocks(found: Findings, streams: list[StreamAccount]) -> list[Requirement]:
         sizes = ", ".join(f"{jump.seconds:+.3f} s" for jump in jumps[:3])
         out.append(
             Requirement(
-                "clock jumps", "the computer's clock", "warn", f"{len(jumps)}: {sizes}", "none",
+                "clock jumps", "the computer's clock", "warn", f"{sizes} ({len(jumps)} in all)", "none",
                 "set the clock before you record, and switch off what sets it meanwhile"
                 + ("; log times are not touched" if found.kind == "rig" else ""),
             )
@@ -270,7 +270,8 @@ def _warned(found: Findings) -> list[Requirement]:
         for warned in mine:
             verdict: Verdict = "fail" if warned.level >= 2 else "warn"
             since = (warned.first_ns - (found.span[0] if found.span else 0)) * 1e-9
-            told = f"{warned.text}, in {warned.count} packages from {since:.2f} s on"
+            packages = "1 package" if warned.count == 1 else f"{warned.count} packages"
+            told = f"{warned.text}, in {packages} from {since:.2f} s on"
             remedy = next(text for word, text in _HEALTH.items() if word in warned.text)
             out.append(Requirement("health", name, verdict, told, "no warnings", remedy))
     return out

@@ -230,6 +230,15 @@ def test_cut_and_lost_files(tmp_path):
     assert json.loads(json_text(check))["verdict"] == "fail"
 
 
+@pytest.mark.parametrize(("state", "n_unexplained"), [("recording", 1), ("recovered", 1), ("closed", 2)])
+def test_what_was_on_its_way_when_a_recording_was_cut_short_is_explained(tmp_path, state, n_unexplained):
+    """The last pictures, but none before."""
+    path = write_folder(tmp_path / "rig", Faults(unfilmed=(10, 118, 119)), seconds=4.0, state=state)
+    check = check_recording(path)
+    assert [gap.lost for gap in check.found.streams[IMAGE].gaps] == [1, 2]
+    assert len(check.unexplained) == n_unexplained
+
+
 def test_without_its_manifest_there_is_nothing_to_explain(tmp_path):
     path = write_folder(tmp_path / "rig", Faults(stalls={IMU: (1.0, 1.0)}), seconds=4.0, manifest=False)
     check = check_recording(path)
