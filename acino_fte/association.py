@@ -23,9 +23,10 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from acino_fte.attaching import Attached, attach, on_link
+from acino_fte.attaching import Attached, attach
 from acino_fte.cameras import Camera
 from acino_fte.depth import BodyReturns, DepthData, MarkerDepths
+from acino_fte.depth_sigma import group_variance, return_variance
 from acino_fte.errors import InputError
 from acino_fte.lidar import Lidar
 from acino_fte.prediction import positions_at
@@ -33,9 +34,6 @@ from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton
 
 ASSOCIATIONS = ("marker", "body", "nearest", "none")
-_SIDE_SD = 0.01  # m: how well the side is known at which a ray passes a link
-_SHAPE = 0.015  # m, standard deviation of the surface about a capsule
-_SLOPE = 0.15  # of the way from a return to its marker along the link, as depth that the pose may be wrong by
 _MOST = 8  # returns of one link and frame that count as distances: more say the same again
 _SCAN = 0.1  # s: what the thesis takes for one frame of the lidar
 _NEAREST_SD = 0.05  # m, of the thesis's way
@@ -99,13 +97,13 @@ def associate(
         return DepthData(camera.name, nearest_depths(sequence, camera, seen), surface=False)
     target = camera.to_camera(positions) if how == "body" else None  # whose residual knows no delay
     found = attach(lidar, sequence.frames, sequence.fps, local, skeleton, surface, front_sd, target)
-    rate = _depth_rate(local, sequence.fps)
     if how == "body":
         found = _thinned(found)
-        sd = np.sqrt(_own_variance(lidar, found, rate))
+        _, way, _ = _to_marker(found, local)
+        variance = return_variance(lidar, found, local, surface, sequence.fps, way, carried=False)
         places = (found.frame, found.start, found.end, found.along, found.bulge)
-        return DepthData(camera.name, BodyReturns(*places, found.depth, sd))
-    return DepthData(camera.name, marker_depths(lidar, found, local, surface, rate))
+        return DepthData(camera.name, BodyReturns(*places, found.depth, np.sqrt(variance.total)))
+    return DepthData(camera.name, marker_depths(lidar, found, local, surface, sequence.fps))
 
 
 def in_view(sequence: Sequence) -> Sequence:
@@ -139,33 +137,33 @@ def _thinned(found: Attached) -> Attached:
 
 
 def marker_depths(
-    lidar: Lidar, found: Attached, local: np.ndarray, surface: np.ndarray, rate: np.ndarray
+    lidar: Lidar, found: Attached, local: np.ndarray, surface: np.ndarray, fps: float
 ) -> MarkerDepths:
     """One depth for every marker and frame: of the returns nearest to it, carried along the link.
 
     A return before the point u of a link is carried to the link's nearer end by what the pose has between
-    them. Its variance is that of the range, of the body's shape, of the time, and of a share of the way.
-    Returns of one marker and frame have one surface and one shape: only their ranges average out.
+    them. How well each tells the depth there, and what they share, is in :mod:`acino_fte.depth_sigma`.
     """
-    nearer = np.where(found.along < 0.5, found.start, found.end)
-    axis = on_link(local[found.frame], found.start, found.end, found.along)
-    marker = local[found.frame, nearer]
+    nearer, way, farther = _to_marker(found, local)
     u = found.along
     thicker = surface[nearer] - found.bulge * ((1 - u) * surface[found.start] + u * surface[found.end])
-    depth = found.depth + marker[:, 2] - axis[:, 2] - thicker
-    way = np.linalg.norm(marker - axis, axis=1)
-    own = _own_variance(lidar, found, rate)
-    carried = own + (_SLOPE * way) ** 2
+    depth = found.depth + farther - thicker
+    variance = return_variance(lidar, found, local, surface, fps, way)
+    weight = 1.0 / variance.total
     key = found.frame * len(surface) + nearer
     groups, place, count = np.unique(key, return_inverse=True, return_counts=True)
-    weight = 1.0 / carried
-    total = np.bincount(place, weight, len(groups))
-    mean = np.bincount(place, weight * depth, len(groups)) / np.maximum(total, 1e-300)
-    floor = np.bincount(place, weight * (carried - lidar.range_sd**2), len(groups)) / np.maximum(
-        total, 1e-300
-    )
-    sd = np.sqrt(floor + lidar.range_sd**2 / count)
+    mean = np.bincount(place, weight * depth, len(groups)) / np.bincount(place, weight, len(groups))
+    link = found.start * len(surface) + found.end
+    sd = np.sqrt(group_variance(variance, weight, place, link, len(groups)))
     return MarkerDepths(groups // len(surface), groups % len(surface), mean, sd, count)
+
+
+def _to_marker(found: Attached, local: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nearer marker of every return (K,), how far along the link it is, and how much deeper, m."""
+    nearer = np.where(found.along < 0.5, found.start, found.end)
+    share = np.where(found.along < 0.5, found.along, 1.0 - found.along)
+    link = local[found.frame, found.start + found.end - nearer] - local[found.frame, nearer]
+    return nearer, share * np.linalg.norm(link, axis=1), -share * link[:, 2]
 
 
 def nearest_depths(sequence: Sequence, camera: Camera, pixels: np.ndarray) -> MarkerDepths:
@@ -192,15 +190,3 @@ def nearest_depths(sequence: Sequence, camera: Camera, pixels: np.ndarray) -> Ma
     count = np.ones(len(table), dtype=int)
     sd = np.full(len(table), _NEAREST_SD)
     return MarkerDepths(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2], sd, count)
-
-
-def _depth_rate(local: np.ndarray, fps: float) -> np.ndarray:
-    """How fast the animal's depth changes in every frame (N,), m/s."""
-    middle = local[..., 2].mean(axis=1)
-    return np.gradient(middle) * fps if len(middle) > 1 else np.zeros(len(middle))
-
-
-def _own_variance(lidar: Lidar, found: Attached, rate: np.ndarray) -> np.ndarray:
-    """Variance of every return, m²: its range, the body's shape, and the synchronisation."""
-    steep = _SIDE_SD * np.sqrt(1.0 - found.bulge**2) / found.bulge  # of a round body, where the ray passes
-    return lidar.range_sd**2 + _SHAPE**2 + steep**2 + (lidar.time_sd * rate[found.frame]) ** 2

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from acino_fte.errors import InputError
+
+BEAM_DEG = (0.02, 0.12)
+"""Full width of the beam of a Livox Tele-15, horizontally and vertically, degrees (its user manual, 2020)."""
+RANGE_SD_PER_M = 1e-4
+"""How the noise of a range grows with it: 1 cm in 100 m, in quadrature with 2 cm close by (an assumption)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +31,13 @@ class Lidar:
     rotation, translation : (3, 3), (3,)
         Lidar to camera: x_camera = rotation @ x_lidar + translation, m.
     range_sd : float
-        Standard deviation of a range, m.
+        Standard deviation of a range close by, m.
     time_sd : float
         Standard deviation of the synchronisation of lidar and camera, s.
+    range_sd_per_m : float
+        What the standard deviation of a range has in addition (in quadrature) for every metre of it.
+    beam : (2,)
+        Full width of the beam along y (horizontal) and z (vertical) of the lidar's frame, rad.
     """
 
     camera: str
@@ -39,6 +48,8 @@ class Lidar:
     translation: np.ndarray
     range_sd: float = 0.02
     time_sd: float = 0.0
+    range_sd_per_m: float = RANGE_SD_PER_M
+    beam: np.ndarray = field(default_factory=lambda: np.radians(BEAM_DEG))
 
     def __post_init__(self) -> None:
         shapes = {"time": (len(self.time),), "xyz": (len(self.time), 3), "intensity": (len(self.time),)}
@@ -52,6 +63,15 @@ class Lidar:
                     found=f"shape {value.shape}, {int((~np.isfinite(value)).sum())} not finite",
                 )
             object.__setattr__(self, key, value)
+        beam = np.asarray(self.beam, dtype=float)
+        if beam.shape != (2,) or not (beam >= 0).all():
+            raise InputError(
+                "The lidar's beam is not usable.",
+                key="beam",
+                expected="two widths, rad",
+                found=str(self.beam),
+            )
+        object.__setattr__(self, "beam", beam)
 
     def __len__(self) -> int:
         return len(self.time)

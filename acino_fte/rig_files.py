@@ -163,6 +163,8 @@ def _write_lidar(simulation: RigSimulation, lidar: Lidar, folder: Path) -> dict[
         "returns": "lidar.npz",
         "calibration": "lidar_camera.json",
         "range_sd": float(lidar.range_sd),
+        "range_sd_per_m": float(lidar.range_sd_per_m),
+        "beam_deg": [round(float(width), 6) for width in np.degrees(lidar.beam)],
         "time_sd_ms": 1e3 * float(lidar.time_sd),
     }
 

@@ -3,7 +3,7 @@
 The sensor is like a Livox Tele-15: 240 000 points a second in a field of 14.5° by 16.2°. Its pattern here
 is a model, not Livox's own: six beams draw a rosette whose two turns are in no whole ratio, and whose radius
 is such that the density is the same all over the ellipse. A point comes 4167 ns after the one before. Beams
-are lines without width.
+are lines, or have a width in which every return has a place of its own.
 
 Frame of the lidar, as Livox has it: x forward, y left, z up.
 """
@@ -147,7 +147,8 @@ def scan(
     period = firing_period(options)
     first, last = math.ceil(start / period), math.ceil(stop / period)
     first -= first % BEAMS
-    rng = {name: options.stream(name) for name in ("grass", "range", "direction", "background", "intensity")}
+    streams = ("grass", "range", "direction", "beam", "background", "intensity")
+    rng = {name: options.stream(name) for name in streams}
     body = Body.of(options, motion)
     parts = []
     for index in range(first, last, _CHUNK):
@@ -168,7 +169,7 @@ def _scan_part(
 ) -> tuple[np.ndarray, ...]:
     """The columns of Returns for points at times (K,)."""
     nominal = scan_directions(time)
-    direction, origin = to_world(path, lidar_to_camera, time, nominal)
+    direction, origin = to_world(path, lidar_to_camera, time, _in_beam(options, rng["beam"], nominal))
     if options.angle_noise_mrad:
         direction = _turned(rng["direction"], direction, 1e-3 * options.angle_noise_mrad)
     still, is_bush = _still_distance(scenery, origin, direction, rng["grass"])
@@ -179,7 +180,7 @@ def _scan_part(
     distance[misled] = _misled(rng["background"], animal[misled], still[misled])
     kinds = np.where(met & ~misled, 0, np.where(is_bush | misled, 2, 1))
     seen = np.isfinite(distance) & (distance < REACH)
-    noisy = distance + rng["range"].standard_normal(len(time)) * options.range_noise_m
+    noisy = distance + rng["range"].standard_normal(len(time)) * _range_sd(options, distance)
     on_body = met & ~misled
     columns = (
         time,
@@ -259,6 +260,24 @@ def _intensity(rng: np.random.Generator, kinds: np.ndarray) -> np.ndarray:
     return np.clip(np.round(mean[kinds] + sd[kinds] * rng.standard_normal(len(kinds))), 0.0, 255.0)
 
 
+def _range_sd(options: RigOptions, distance: np.ndarray) -> np.ndarray:
+    """Standard deviation of ranges at distances (K,), m; that of no distance where it is infinite."""
+    if not options.range_noise_per_m:
+        return np.full(len(distance), options.range_noise_m)
+    reached = np.where(np.isfinite(distance), distance, 0.0)
+    return np.hypot(options.range_noise_m, options.range_noise_per_m * reached)
+
+
+def _in_beam(options: RigOptions, rng: np.random.Generator, nominal: np.ndarray) -> np.ndarray:
+    """Directions (K, 3), frame of the lidar, at which the beams that point at `nominal` meet something."""
+    quarter = 0.25 * np.radians([options.beam_width_deg, options.beam_height_deg])
+    if not quarter.any():
+        return nominal
+    aside = rng.standard_normal((len(nominal), 2)) * quarter
+    turned = nominal + np.concatenate([np.zeros((len(nominal), 1)), aside], axis=1)
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
 def _turned(rng: np.random.Generator, direction: np.ndarray, sd: float) -> np.ndarray:
     noise = rng.standard_normal(direction.shape) * sd
     turned = direction + np.cross(noise, direction)
@@ -290,7 +309,7 @@ def pseudo_returns(
     place = local / away[:, None] * distance[:, None]
     xyz = (place - translation) @ rotation
     reach = np.linalg.norm(xyz, axis=1)
-    xyz *= (1.0 + rng["range"].standard_normal(len(time)) * options.range_noise_m / reach)[:, None]
+    xyz *= (1.0 + rng["range"].standard_normal(len(time)) * _range_sd(options, reach) / reach)[:, None]
     kinds = np.where(misled, 2, 0)
     return Returns(
         time,

@@ -250,6 +250,8 @@ def _given_lidar(options: RigOptions, returns: Returns, mount: tuple[np.ndarray,
         mount[1] + shift,
         max(options.range_noise_m, _LEAST_RANGE_SD),
         max(TIME_SD, 1e-3 * abs(options.sync_ms)),
+        options.range_noise_per_m,
+        np.radians([options.beam_width_deg, options.beam_height_deg]),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import hypot
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -14,6 +14,7 @@ from acino_fte.species_file import read_yaml, validation_message
 
 FORMAT = "acino-fte/sequence/1"
 FILE_NAME = "sequence.yaml"
+Beam = Annotated[float, Field(ge=0, le=10)]
 
 
 class Ground(BaseModel):
@@ -51,7 +52,13 @@ class LidarEntry(BaseModel):
     direction: Literal["lidar_to_camera", "camera_to_lidar"] | None = Field(
         None, description="which way the calibration goes, where its file does not say so"
     )
-    range_sd: float = Field(0.02, gt=0, description="standard deviation of a range, m")
+    range_sd: float = Field(0.02, gt=0, description="standard deviation of a range close by, m")
+    range_sd_per_m: float = Field(
+        1e-4, ge=0, le=1, description="what it has in addition for every metre, in quadrature"
+    )
+    beam_deg: tuple[Beam, Beam] = Field(
+        (0.02, 0.12), description="full width of the beam along y and z of the lidar's frame, degrees"
+    )
     time_sd_ms: float = Field(0.0, ge=0, description="standard deviation of the synchronisation, ms")
 
     @field_validator("camera", mode="before")

@@ -71,6 +71,8 @@ def read_lidar(entry: LidarEntry, cameras: CameraArray, source: Path) -> tuple[L
         calibration.translation,
         entry.range_sd,
         1e-3 * entry.time_sd_ms,
+        entry.range_sd_per_m,
+        np.radians(entry.beam_deg),
     )
     return lidar, _lens_warnings(camera, calibration, Path(entry.calibration).name)
 

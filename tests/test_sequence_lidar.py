@@ -33,6 +33,8 @@ def test_a_sequence_with_a_lidar_is_read_as_it_was_written(simulation, folder):
     assert read.lidar.camera == "cam1"
     assert read.lidar.range_sd == pytest.approx(meant.lidar.range_sd)
     assert read.lidar.time_sd == pytest.approx(meant.lidar.time_sd)
+    assert read.lidar.range_sd_per_m == meant.lidar.range_sd_per_m
+    np.testing.assert_allclose(read.lidar.beam, meant.lidar.beam)
     assert Path(read.provenance["lidar"]["returns"]).is_absolute()
 
 
@@ -103,6 +105,8 @@ FAULTS = {
     "camera": (lambda f: edited(f, "camera: cam1", "camera: cam2"), "lidar.camera"),
     "key": (lambda f: edited(f, "range_sd", "range_ds"), "range_ds"),
     "range": (lambda f: edited(f, "range_sd: 0.02", "range_sd: -1"), "range_sd"),
+    "growth": (lambda f: edited(f, "range_sd_per_m: 0.0", "range_sd_per_m: 2"), "range_sd_per_m"),
+    "beam": (lambda f: edited(f, "beam_deg:\n  - 0.0", "beam_deg:\n  - -0.1"), "beam_deg"),
     "gone": (lambda f: (f / "lidar.npz").unlink(), "lidar.returns"),
     "text": (lambda f: (f / "lidar.npz").write_text("x,y,z"), "lidar.returns"),
     "empty": (lambda f: (f / "lidar.npz").write_bytes(b""), "lidar.returns"),
