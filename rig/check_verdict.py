@@ -47,6 +47,8 @@ def requirements(found: Findings, unexplained: list[str]) -> list[Requirement]:
     lines = [_readable(found)]
     if found.manifest is not None:
         lines += [_closed(found), *_ended(found), _explained(unexplained)]
+    elif found.kind == "rig":
+        lines.append(_closed(found))
     streams = [stream for stream in found.streams.values() if stream.kind != "image" or stream.count]
     streams = [stream for stream in streams if stream.kind != "other"]
     for stream in streams:
@@ -86,7 +88,12 @@ def _readable(found: Findings) -> Requirement:
 
 
 def _closed(found: Findings) -> Requirement:
-    state = found.manifest.state if found.manifest is not None else ""
+    if found.manifest is None:
+        return Requirement(
+            "closed", "the recording", "warn", "its manifest is lost or damaged", "closed",
+            "what the recorder noted is not known; acino-fte rig recover makes a new manifest",
+        )  # fmt: skip
+    state = found.manifest.state
     if state == "recording":
         return Requirement(
             "closed", "the recording", "warn", "it was never closed", "closed",

@@ -244,6 +244,7 @@ def test_without_its_manifest_there_is_nothing_to_explain(tmp_path):
     check = check_recording(path)
     assert check.unexplained == () and check.verdict == "fail"
     assert "explained" not in {one.name for one in check.requirements}
+    assert verdicts(check)["closed", "the recording"] == "warn"
     (gap,) = check.found.streams[IMU].gaps
     assert gap.lost == 100
 
