@@ -55,7 +55,7 @@ def test_the_commands_of_the_guide(tmp_path, monkeypatch, capsys):
         assert found.exit_code in (0, 1) and "Traceback" not in found.output, (words, found.output)
         if words[0] == "check":
             assert found.exit_code == 1  # the practice has a stall
-            shown = re.search(r"```\n(✗.*?)\n```", text, re.S)[1]
+            shown = re.search(r"```text\n(✗.*?)\n```", text, re.S)[1]
             assert shown in found.output
     assert sorted(path.name for path in Path("checked").iterdir()) == [
         "check.html", "check.json", "timeline.png"
