@@ -169,12 +169,36 @@ def find_mounting(
     turn = felt(offset)
     matrix, weight = _robust_wahba(seen, turn)
     slope = (felt(offset + 0.25 * step) - felt(offset - 0.25 * step)) / (0.5 * step)
+    shared = stride if motion.numbers.get("model") == "full" else 2  # errors of chained turns add up
+    covariance, variance = _mounting_covariance(seen, turn, slope, matrix, weight, shared)
+    notes: tuple[str, ...] = (
+        f"Mounting found from {int((weight > 0).sum())} turns, offset {1e3 * offset:+.1f} ms ± "
+        f"{1e3 * np.sqrt(covariance[3, 3]):.1f} ms.",
+    )
+    if abs(offset) > max_offset - 2 * step:
+        notes += ("The offset lies at the end of what was searched; it may be longer.",)
+    return Mounting(
+        matrix, covariance[:3, :3], offset, float(np.sqrt(covariance[3, 3])), float(np.sqrt(variance)), notes
+    )
+
+
+def _mounting_covariance(
+    seen: np.ndarray, turn: np.ndarray, slope: np.ndarray, matrix: np.ndarray, weight: np.ndarray, shared: int
+) -> tuple[np.ndarray, float]:
+    """Covariance (4, 4) of a small turn of the mounting (rad) and the offset (s), and the variance of a turn.
+
+    Of turns `seen` in the pictures, felt by the sensor (`turn`, with its `slope` by the offset), (P, 3); that
+    many (`shared`) have errors in common.
+
+    Raises
+    ------
+    InputError
+        The turns leave the mounting open.
+    """
     jacobian = np.concatenate([cross_matrix(turn @ matrix.T), -(slope @ matrix.T)[:, :, None]], axis=2)
     left = seen - turn @ matrix.T
-    used = weight > 0
     variance = float((weight[:, None] * left**2).sum() / max(3 * weight.sum() - 4, 1.0))
     information = np.einsum("k,kij,kil->jl", weight, jacobian, jacobian)
-    shared = stride if motion.numbers.get("model") == "full" else 2  # errors of chained turns add up
     covariance = shared * variance * np.linalg.pinv(information, rcond=1e-12)
     worst = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     if worst > _UNSURE or np.linalg.eigvalsh(information[:3, :3])[0] < 1e-9:
@@ -187,15 +211,7 @@ def find_mounting(
             found=f"turns of {np.degrees(np.abs(seen).max()):.2f}° at most, which leave {left_open}",
             remedy="state the mounting (--imu-to-camera), or record one pan and one tilt by hand",
         )
-    notes: tuple[str, ...] = (
-        f"Mounting found from {int(used.sum())} turns, offset {1e3 * offset:+.1f} ms ± "
-        f"{1e3 * np.sqrt(covariance[3, 3]):.1f} ms.",
-    )
-    if abs(offset) > max_offset - 2 * step:
-        notes += ("The offset lies at the end of what was searched; it may be longer.",)
-    return Mounting(
-        matrix, covariance[:3, :3], offset, float(np.sqrt(covariance[3, 3])), float(np.sqrt(variance)), notes
-    )
+    return covariance, variance
 
 
 def _pairs(
