@@ -30,8 +30,8 @@ LONGEST_S = 6.0  # until a kill
 
 
 def faults_of(seconds: float) -> list[str]:
-    """Faults of every kind, spread over a recording."""
-    at = [round(seconds * share, 1) for share in np.linspace(0.05, 0.95, 14)]
+    """Faults of every kind, spread over a recording; the last one, a full disk, ends it."""
+    at = [*(round(seconds * share, 1) for share in np.linspace(0.05, 0.95, 13)), seconds]
     return [
         f"stall:cam1@{at[0]}+2",
         f"stall:lidar1@{at[1]}+2",
@@ -59,7 +59,7 @@ def recording(seconds: float, folder: Path, fast: bool, with_faults: bool) -> in
     session = Session(rig, folder, SessionOptions(simulate=True, fast=fast, faults=faults))
     session.preflight()
     begun, used = time.perf_counter(), time.process_time()
-    manifest = session.record(seconds)
+    manifest = session.record(seconds + with_faults)  # a full disk ends it before
     took, used = time.perf_counter() - begun, time.process_time() - used
     sources = session.equipment.sources
     problems = problems_of(folder, rig, sources, faults, DECODE_EVERY) + unexplained(manifest, faults)
