@@ -173,12 +173,9 @@ def simulate_rig(options: RigOptions | None = None, skeleton: Skeleton | None = 
     hidden = hidden_by_body(skeleton, positions, CameraArray((camera,)))
     mount = rotation_matrix(np.array(MOUNT_ROTATION)) @ LIVOX_AXES, np.array(MOUNT_TRANSLATION)
     scenery = place_scenery(options, path, motion)
-    returns = None
-    if options.lidar == "scan":
-        returns = scan(options, motion, path, mount, scenery)
-    elif options.lidar == "pseudo":
-        visible = camera.inside(pixels) & ~hidden[:, 0]
-        returns = pseudo_returns(options, positions, visible, path, mount)
+    returns = _returns(
+        options, motion, path, mount, scenery, (positions, camera.inside(pixels) & ~hidden[:, 0])
+    )
     imu, bias = simulate_imu(options, path, mount)
     return RigSimulation(
         skeleton,
@@ -200,6 +197,20 @@ def simulate_rig(options: RigOptions | None = None, skeleton: Skeleton | None = 
         motion,
         flaws.parameters(skeleton, [CAMERA]),
     )
+
+
+def _returns(
+    options: RigOptions,
+    motion: Motion,
+    path: CameraPath,
+    mount: tuple[np.ndarray, np.ndarray],
+    scenery: Scenery,
+    shown: tuple[np.ndarray, np.ndarray],
+) -> Returns | None:
+    """What the lidar returns, if there is one; `shown` are markers (N, M, 3), and which are seen (N, M)."""
+    if options.lidar == "scan":
+        return scan(options, motion, path, mount, scenery)
+    return pseudo_returns(options, *shown, path, mount) if options.lidar == "pseudo" else None
 
 
 def _draw_flaws(skeleton: Skeleton, options: RigOptions) -> Imperfections:

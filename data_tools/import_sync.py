@@ -246,16 +246,7 @@ def _by_event(inputs: Inputs, timing: Timing) -> Synchronisation:
         )
         return replace(found, notes=(*notes, *found.notes))
     if inputs.pictures is None or inputs.imu is None:
-        missing = "no pictures" if inputs.pictures is None else "no inertial sensor in the recording"
-        raise InputError(
-            "Nothing tells when the frames were taken.",
-            key="--pivot",
-            expected="stamps of the camera in the recording, or one event: " + PIVOTS,
-            found=missing,
-            remedy="with keypoints of a running animal: --pivot strike. Or find an event that video and "
-            "lidar both show, and give its frame and the lidar's time (seconds from its first return): "
-            "--pivot 120=3.45",
-        )
+        raise _nothing_tells(inputs)
     start, stop = _motion_frames(inputs, fps)
     part = image_motion(inputs.pictures.frames(start, stop))
     imu_time, rate = _imu_motion(inputs, inputs.imu, timing)
@@ -272,6 +263,20 @@ def _by_event(inputs: Inputs, timing: Timing) -> Synchronisation:
         frame_sd_ms=np.hypot(base.frame_sd_ms, 1e3 * found.sd),
         method="motion",
         notes=(*base.notes, note),
+    )
+
+
+def _nothing_tells(inputs: Inputs) -> InputError:
+    """That there is neither a stamp, nor an event, nor a motion."""
+    missing = "no pictures" if inputs.pictures is None else "no inertial sensor in the recording"
+    return InputError(
+        "Nothing tells when the frames were taken.",
+        key="--pivot",
+        expected="stamps of the camera in the recording, or one event: " + PIVOTS,
+        found=missing,
+        remedy="with keypoints of a running animal: --pivot strike. Or find an event that video and "
+        "lidar both show, and give its frame and the lidar's time (seconds from its first return): "
+        "--pivot 120=3.45",
     )
 
 

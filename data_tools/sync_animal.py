@@ -115,6 +115,27 @@ def animal_lag(outline: Outline, glimpses: Glimpses, lags: tuple[float, float]) 
             continue
         if lags[0] - period <= fit.lag <= lags[1] + period:
             fits.append(fit)
+    best, sd, sigmas = _chosen(fits, period)
+    if sd > _MOST_SD * period:
+        raise InputError(
+            "The animal moves too little in the picture to tell the time.",
+            key="--pivot",
+            expected=f"a time known to a frame, {1e3 * period:.1f} ms",
+            found=f"± {1e3 * sd:.1f} ms",
+            remedy="import more frames, or frames in which it runs",
+        )
+    parts = _parts(outline, glimpses, best.lag)
+    return AnimalLag(best.lag, sd, best.shift, best.n, float(sigmas), parts)
+
+
+def _chosen(fits: list[_Fit], period: float) -> tuple[_Fit, float, float]:
+    """The best of some lags, its standard deviation (s), and by how many of them it beats the next.
+
+    Raises
+    ------
+    InputError
+        There is none, or another one is nearly as good.
+    """
     if not fits:
         raise InputError(
             "The lidar does not show the animal of the video.",
@@ -141,16 +162,7 @@ def animal_lag(outline: Outline, glimpses: Glimpses, lags: tuple[float, float]) 
             remedy="say roughly when: --pivot strike:FRAME=SECONDS; or, where the camera dropped frames, how "
             "many it took: --exposed N",
         )
-    if sd > _MOST_SD * period:
-        raise InputError(
-            "The animal moves too little in the picture to tell the time.",
-            key="--pivot",
-            expected=f"a time known to a frame, {1e3 * period:.1f} ms",
-            found=f"± {1e3 * sd:.1f} ms",
-            remedy="import more frames, or frames in which it runs",
-        )
-    parts = _parts(outline, glimpses, best.lag)
-    return AnimalLag(best.lag, sd, best.shift, best.n, float(sigmas), parts)
+    return best, sd, sigmas
 
 
 def _better(best: _Fit, other: _Fit) -> float:
