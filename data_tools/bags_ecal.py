@@ -42,7 +42,7 @@ class EcalWalk(FileWalk):
                     losses.note(f"the table of the channel {name} is missing")
                     continue
                 rows, kind = table
-                self.channels[number] = Channel(_topic(name), _type(kind), "", "ros2msg", CUSTOM, 2)
+                self.channels[number] = Channel(topic_of(name), type_of(kind), "", "ros2msg", CUSTOM, 2)
                 self.counts[number] = len(rows)
                 self._tables.append(np.column_stack([rows[:, :2], np.full(len(rows), number)]))
 
@@ -57,7 +57,7 @@ class EcalWalk(FileWalk):
             ) from error
 
     def _names(self, file: Any) -> list[str]:
-        version, channels = _text(file.attrs.get("Version", "")), _text(file.attrs.get("Channels", ""))
+        version, channels = text_of(file.attrs.get("Version", "")), text_of(file.attrs.get("Channels", ""))
         if not version.startswith("5"):
             raise InputError(
                 "The HDF5 file is no recording that can be read.",
@@ -73,7 +73,7 @@ class EcalWalk(FileWalk):
         for key in (name, quote(name, safe=""), unquote(name)):
             data = file.get(key)
             if data is not None and getattr(data, "ndim", 0) == 2 and data.shape[1] >= 2:
-                return np.asarray(data[:, :2], np.int64), _text(data.attrs.get("Channel Type", ""))
+                return np.asarray(data[:, :2], np.int64), text_of(data.attrs.get("Channel Type", ""))
         return None
 
     def overview(self) -> bool:
@@ -98,19 +98,20 @@ class EcalWalk(FileWalk):
                 self.losses.note(f"{stray} messages are in no table: the recording was cut", stray)
 
 
-def _text(value: Any) -> str:
+def text_of(value: Any) -> str:
+    """An attribute of HDF5 as text."""
     if isinstance(value, np.ndarray):
         value = value.tobytes() if value.dtype.kind in "SV" else value.ravel()[0] if value.size else ""
     return (value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)).rstrip("\0")
 
 
-def _topic(name: str) -> str:
+def topic_of(name: str) -> str:
     """``/livox/imu`` of ``rt/livox/imu``, ROS 2's name of a topic on the wire."""
     name = unquote(name)
     return name[2:] if name.startswith("rt/") else name
 
 
-def _type(name: str) -> str:
+def type_of(name: str) -> str:
     """``package/msg/Type`` of ``package::msg::dds_::Type_`` and its like."""
     parts = [part for part in re.split(r"::|/", name) if part and part != "dds_"]
     return "/".join(parts).removesuffix("_")

@@ -153,7 +153,7 @@ class McapWalk(FileWalk):
         """The records of a chunk."""
         start = window.at
         end = start + 9 + length
-        fields = _chunk_fields(window.peek(9 + 40 + 16)[9:])
+        fields = chunk_fields(window.peek(9 + 40 + 16)[9:])
         known = end <= self._file_end and (end == self._file_end or _head_at(window, end) is not None)
         if fields is None:
             self.losses.note(f"the chunk at byte {start} has a damaged head")
@@ -217,7 +217,7 @@ class McapWalk(FileWalk):
             if number not in self.channels:
                 return False
         if end > window.end:
-            return op == _CHUNK and _chunk_fields(block[at + 9 : at + 64]) is not None
+            return op == _CHUNK and chunk_fields(block[at + 9 : at + 64]) is not None
         if end == window.end:
             return True
         if isinstance(window, FileWindow):
@@ -233,7 +233,7 @@ def _parse(data: memoryview) -> tuple[int, int] | None:
     op, length = data[0], int.from_bytes(data[1:9], "little")
     if not 1 <= op <= _LAST_OP or length < _LEAST[op]:
         return None
-    if op == _CHUNK and len(data) >= 64 and _chunk_fields(data[9:]) is None:
+    if op == _CHUNK and len(data) >= 64 and chunk_fields(data[9:]) is None:
         return None
     if op in (_FOOTER, _DATA_END) and length != _LEAST[op]:
         return None
@@ -248,7 +248,7 @@ def _head_at(window: FileWindow, at: int) -> tuple[int, int] | None:
     return _parse(window.peek_at(at, 64))
 
 
-def _chunk_fields(data: memoryview) -> tuple[int, int, str, int, int] | None:
+def chunk_fields(data: memoryview) -> tuple[int, int, str, int, int] | None:
     """(unpacked bytes, CRC-32, compression, bytes before the records, bytes of the records) of a chunk."""
     if len(data) < 40:
         return None

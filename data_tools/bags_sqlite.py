@@ -28,7 +28,7 @@ from acino_fte.data_tools.bags_window import (
 from acino_fte.data_tools.ros_messages import type_name
 
 MAGIC = b"SQLite format 3\0"
-_BROKEN = (sqlite3.Error, ValueError, OverflowError)  # what a damaged database makes SQLite's module raise
+BROKEN = (sqlite3.Error, ValueError, OverflowError)  # what a damaged database makes SQLite's module raise
 _LEAF = 13
 _FIRST_PAGES = 64  # hold topics and definitions, as these are written first
 _INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
@@ -61,7 +61,7 @@ class SqliteWalk(FileWalk):
                 self._topics(connection)
                 rows = connection.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id")
                 self.counts = dict(rows.fetchall())
-        except _BROKEN:
+        except BROKEN:
             return False
         return True
 
@@ -97,7 +97,7 @@ class SqliteWalk(FileWalk):
                         yield from self._message(topic, stamp, data)
                         self._last = number
                 return
-            except _BROKEN as error:
+            except BROKEN as error:
                 self.losses.note(
                     f"SQLite stops after row {self._last} ({error}); its pages are read one by one"
                 )
@@ -106,7 +106,7 @@ class SqliteWalk(FileWalk):
     def _size_said(self) -> int:
         with self.path.open("rb") as file:
             head = file.read(100)
-        return _page_size(head) * int.from_bytes(head[28:32], "big")
+        return page_size(head) * int.from_bytes(head[28:32], "big")
 
     def _message(self, topic: Any, stamp: Any, data: Any) -> Messages:
         channel = self.channels.get(topic)
@@ -122,7 +122,7 @@ class SqliteWalk(FileWalk):
         """Messages of all leaves after the row that SQLite gave last."""
         with self.path.open("rb") as file:
             head = file.read(100)
-            size = _page_size(head)
+            size = page_size(head)
             if len(head) < 100 or not size:
                 self.losses.note("the head of the database is damaged")
                 return
@@ -133,7 +133,7 @@ class SqliteWalk(FileWalk):
                 leaves = ((pages.first_row(page), page) for page in range(1, pages.count + 1))
                 for _, page in sorted(leaf for leaf in leaves if leaf[0] is not None):
                     for number, row in pages.rows(page, self.losses):
-                        if _is_message(row) and number > last:
+                        if is_message(row) and number > last:
                             yield from self._message(row[1], row[2], row[3])
                 missing = pages.said - pages.count
                 if missing > 0:
@@ -148,7 +148,7 @@ class SqliteWalk(FileWalk):
         quiet = Losses()
         for page in range(1, pages.count + 1):
             for number, row in pages.rows(page, quiet):
-                if _is_message(row):
+                if is_message(row):
                     continue
                 strings = [value for value in row[1:5] if isinstance(value, str)]
                 if len(row) >= 4 and row[0] is None and len(strings) >= 3:
@@ -283,7 +283,8 @@ class Pages:
             (page,) = struct.unpack_from(">I", raw)
 
 
-def _page_size(head: bytes) -> int:
+def page_size(head: bytes) -> int:
+    """Bytes of a page, by the head of the database; 0 where it says nothing that can be."""
     size = int.from_bytes(head[16:18], "big")
     size = 65536 if size == 1 else size
     return size if 512 <= size <= 65536 and size & (size - 1) == 0 and head[:16] == MAGIC else 0
@@ -334,7 +335,7 @@ def _checksum(data: bytes, sums: tuple[int, int], order: str) -> tuple[int, int]
     return a, b
 
 
-def _is_message(row: list[Any]) -> bool:
+def is_message(row: list[Any]) -> bool:
     """Whether a row is of the table of messages: id, topic, stamp, data."""
     return (
         len(row) == 4

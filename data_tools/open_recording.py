@@ -98,7 +98,7 @@ def _kind(path: Path) -> RecordingKind:
         return "lvx"
     if bag_kind(path) is not None:
         return "bag"
-    if _is_video(head):
+    if is_video(head):
         return "video"
     if _known(head) is None and _has_frames(path):
         return "lvx"
@@ -129,7 +129,7 @@ def _folder_kind(path: Path) -> RecordingKind:
     )
 
 
-def _is_video(head: bytes) -> bool:
+def is_video(head: bytes) -> bool:
     """Whether the first bytes are those of a container of videos."""
     return (
         head[4:8] in (b"ftyp", b"styp", b"moov", b"mdat", b"wide", b"free", b"skip")

@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from acino_fte.data_tools.bags_ecal import EcalWalk, _text, _topic, _type
+from acino_fte.data_tools.bags_ecal import EcalWalk, text_of, topic_of, type_of
 from acino_fte.data_tools.bags_serial import CUSTOM, DecodeError, decode, definitions
 from acino_fte.data_tools.ros_messages import LIVOX_PACKAGES, XIMEA_TYPE
 from acino_fte.errors import InputError
@@ -120,7 +120,7 @@ def _copied(
         sent = row[2] if row else stamp
         out.create_dataset(str(number), data=np.frombuffer(data, np.uint8))
         channel.rows.append((stamp, number, len(channel.rows), sent, 0))
-        tally.add(_topic(channel.name), _type(channel.type), stamp * 1000, losses.n_notes)
+        tally.add(topic_of(channel.name), type_of(channel.type), stamp * 1000, losses.n_notes)
         losses.read += 1
         numbers.add(number)
     return numbers
@@ -259,8 +259,8 @@ def _tables(source: Path) -> dict[int, tuple[_Found, int, int]]:
                 data = file[key]
                 if key.isdigit() or getattr(data, "ndim", 0) != 2 or data.shape[1] < 5:
                     continue
-                name = _text(data.attrs.get("Channel Name", "")) or key
-                found = _Found(name, _text(data.attrs.get("Channel Type", "")), _description(data))
+                name = text_of(data.attrs.get("Channel Name", "")) or key
+                found = _Found(name, text_of(data.attrs.get("Channel Type", "")), _description(data))
                 out |= {int(row[1]): (found, int(row[0]), int(row[3])) for row in data[()]}
     except (OSError, RuntimeError, ValueError, KeyError):
         pass
@@ -336,13 +336,13 @@ class _Sorter:
             n = len(found.rows)
             if found.name == _UNKNOWN:
                 out.append(
-                    f"{n} messages are of no known type: they are kept as they are in {_topic(found.name)}."
+                    f"{n} messages are of no known type: they are kept as they are in {topic_of(found.name)}."
                 )
             elif found in self._named.values():
-                out.append(f"{_topic(found.name)}: its {n} messages were told by their content.")
+                out.append(f"{topic_of(found.name)}: its {n} messages were told by their content.")
             else:
                 out.append(
-                    f"{_topic(found.name)}: the channel's own name is lost; its {n} messages were told by "
+                    f"{topic_of(found.name)}: the channel's own name is lost; its {n} messages were told by "
                     "their content, and a sound recording given with --like would name it."
                 )
         out.append(
@@ -363,17 +363,17 @@ def _channels_of(like: Path) -> dict[tuple[str, str], _Found]:
             data = file[key]
             if key.isdigit() or getattr(data, "ndim", 0) != 2 or not len(data):
                 continue
-            kind = _text(data.attrs.get("Channel Type", ""))
-            name = _text(data.attrs.get("Channel Name", "")) or key
+            kind = text_of(data.attrs.get("Channel Type", ""))
+            name = text_of(data.attrs.get("Channel Name", "")) or key
             frame = ""
             try:
                 raw = file[str(int(data[0, 1]))][()].tobytes()
-                frame = decode(raw, _type(kind), definitions(_type(kind), "", 2), CUSTOM)["header"][
+                frame = decode(raw, type_of(kind), definitions(type_of(kind), "", 2), CUSTOM)["header"][
                     "frame_id"
                 ]
             except (DecodeError, KeyError, TypeError, OSError):
                 continue
-            out[_type(kind), frame] = _Found(_topic_name(name), kind, _description(data))
+            out[type_of(kind), frame] = _Found(_topic_name(name), kind, _description(data))
     return out
 
 

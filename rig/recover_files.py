@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from acino_fte.data_tools.bags import bag_kind
 from acino_fte.data_tools.bags_window import Losses, decompressor
-from acino_fte.data_tools.open_recording import _is_video, recording_kind
+from acino_fte.data_tools.open_recording import is_video, recording_kind
 from acino_fte.data_tools.video import VIDEO_SUFFIXES
 from acino_fte.errors import InputError
 from acino_fte.rig.recover_types import Salvaged
@@ -61,7 +61,7 @@ def file_kind(path: Path) -> FileKind:
     named = _BY_SUFFIX.get(path.suffix.lower())
     if named == "lvx":
         return named
-    if _is_video(head):
+    if is_video(head):
         return "video"
     try:
         kind = recording_kind(path)

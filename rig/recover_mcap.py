@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from acino_fte.data_tools.bags_mcap import MAGIC, McapWalk, _chunk_fields
+from acino_fte.data_tools.bags_mcap import MAGIC, McapWalk, chunk_fields
 from acino_fte.data_tools.bags_window import Channel, Losses, Messages, RawMessage
 from acino_fte.extras import missing_package
 from acino_fte.rig.recover_bags import by_topic, plausible, salvaged
@@ -52,7 +52,7 @@ class _Mcap(McapWalk):
             yield RawMessage(message.channel, message.received_ns, content)
 
     def _chunk(self, window: Any, length: int) -> Any:
-        fields = _chunk_fields(window.peek(_HEAD + 64)[_HEAD:])
+        fields = chunk_fields(window.peek(_HEAD + 64)[_HEAD:])
         if self.compression is None and fields is not None:
             self.compression = fields[2]
         return super()._chunk(window, length)

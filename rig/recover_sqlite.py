@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from acino_fte.data_tools.bags_serial import LAYOUTS
-from acino_fte.data_tools.bags_sqlite import _BROKEN, Pages, SqliteWalk, _is_message, _page_size
+from acino_fte.data_tools.bags_sqlite import BROKEN, Pages, SqliteWalk, is_message, page_size
 from acino_fte.data_tools.bags_window import ZSTD, Channel, Losses, Messages, RawMessage
 from acino_fte.rig.recover_bags import UNKNOWN, by_topic, sentence
 from acino_fte.rig.recover_types import Noted, Salvaged, Tally, elsewhere
@@ -86,7 +86,7 @@ class _Rows(SqliteWalk):
         """Messages of all leaves after the row that SQLite gave last, each row once."""
         with self.path.open("rb") as file:
             head = file.read(100)
-            size = _page_size(head)
+            size = page_size(head)
             if not size:
                 self.losses.note("the head of the database is damaged: it is read as rosbag2 writes it")
             pages = Pages(file, size or _PAGE, size - head[20] if size else _PAGE, self._log)
@@ -95,7 +95,7 @@ class _Rows(SqliteWalk):
                 leaves = ((pages.first_row(page), page) for page in range(1, pages.count + 1))
                 for _, page in sorted(leaf for leaf in leaves if leaf[0] is not None):
                     for number, row in pages.rows(page, self.losses):
-                        if _is_message(row) and number > self._last and number not in self.numbers:
+                        if is_message(row) and number > self._last and number not in self.numbers:
                             self.numbers.add(number)
                             yield from self._message(row[1], row[2], row[3])
                 missing = pages.said - pages.count
@@ -158,7 +158,7 @@ def sqlite_is_sound(source: Path) -> bool:
     try:
         with closing(sqlite3.connect(uri, uri=True)) as database:
             return bool(database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",))
-    except _BROKEN:
+    except BROKEN:
         return False
 
 
@@ -191,7 +191,7 @@ def _rolled_back(source: Path, target: Path | None, notes: list[str]) -> Iterato
         copy = Path(folder) / source.name
         shutil.copyfile(source, copy)
         shutil.copyfile(journal, copy.with_name(journal.name))
-        with suppress(*_BROKEN), closing(sqlite3.connect(copy)) as connection:
+        with suppress(*BROKEN), closing(sqlite3.connect(copy)) as connection:
             connection.execute("SELECT count(*) FROM sqlite_master").fetchall()  # SQLite takes the journal
         notes.append("A journal lay beside it: the writing that it interrupted was undone in the copy.")
         yield copy
