@@ -16,12 +16,12 @@ import numpy as np
 
 from acino_fte.data_tools.bags import BagReader
 from acino_fte.data_tools.recording import Damage, Kind, Picture, PictureInfo, Record, Stream
+from acino_fte.data_tools.rig_pairs import pair_frames
 from acino_fte.data_tools.rig_recording import MANIFEST, Manifest, read_manifest
 from acino_fte.errors import InputError
 
 _MESSAGES = re.compile(r"messages-(\d+)\.mcap")
 _VIDEO = re.compile(r"(.+)-(\d+)\.(mkv|mp4|avi)")
-_NEAR = 0.45  # of a period: how far the time of a frame may lie from that of its message
 _PLACES = 20
 
 
@@ -51,8 +51,9 @@ class RigReader:
 
     Streams are named by topic. A camera's pictures are the stream ``/cam1/image`` beside ``/cam1/info``: a
     picture comes right after the message that tells of it, and has its stamps and its number. Frame k of a
-    segment's video belongs to message k of the segment; where their counts differ, to the message of its
-    time. ``received_ns`` is the monotonic clock of the computer, ``published_ns`` its wall clock.
+    segment's video belongs to message k of the segment; where something of either is lost, their times tell
+    (:mod:`~acino_fte.data_tools.rig_pairs`). ``received_ns`` is the monotonic clock of the computer,
+    ``published_ns`` its wall clock.
 
     Parameters
     ----------
@@ -244,29 +245,28 @@ class RigReader:
             stamps = self._stamps(file) if file is not None else np.zeros(0, np.int64)
             counts = {stream.name: stream.count or 0 for stream in self._streams_of(segment)}
             n = counts.get(_info(camera), 0)
-            if len(stamps) == n:
+            if len(stamps) == n and n and self._as_closed(segment, camera, n):
                 self._rows[key] = np.arange(n)
             elif not len(stamps) or not n:
                 self._rows[key] = np.full(n, -1)
             else:
-                self._rows[key] = self._by_time(segment, camera, stamps)
+                started = self.manifest.started_ns if self.manifest is not None else None
+                self._rows[key] = pair_frames(stamps, self._logs(segment, camera), started)
         return self._rows[key]
 
-    def _by_time(self, segment: _Segment, camera: str, stamps: np.ndarray) -> np.ndarray:
-        """The frames of messages, where their counts differ: by the log times of the messages."""
+    def _logs(self, segment: _Segment, camera: str) -> np.ndarray:
+        """Log times (K,) of a camera's messages in a segment, ns."""
         bag = self._bag(segment)
         records = bag.records(["image_info"], [_info(camera)]) if bag is not None else iter(())
-        logs = np.array([record.received_ns or 0 for record in records], np.int64)
-        if not len(logs):
-            return np.full(0, -1)
-        starts = [int(logs[0] - stamps[0]), int(logs[-1] - stamps[-1])]
-        if self.manifest is not None:
-            starts.insert(0, self.manifest.started_ns)
-        period = (
-            float(np.median(np.diff(stamps if len(stamps) > len(logs) else logs))) if len(logs) > 1 else 1e9
-        )
-        found = [_nearest(stamps + start, logs, _NEAR * max(period, 1e6)) for start in starts]
-        return max(found, key=lambda frames: int((frames >= 0).sum()))
+        return np.array([record.received_ns or 0 for record in records], np.int64)
+
+    def _as_closed(self, segment: _Segment, camera: str, n: int) -> bool:
+        """Whether both files of a segment hold what the recorder counted when it closed them."""
+        if self.manifest is None or self.manifest.state == "recovered":
+            return False
+        known = {one.file: one.counts for one in self.manifest.segments if one.closed}
+        files = {_info(camera): segment.messages, camera: segment.videos[camera]}
+        return all(file and known.get(file.name, {}).get(name) == n for name, file in files.items())
 
     def picture_stamps(self, stream: str) -> np.ndarray:
         """Stamps (N,) int64 of a camera's pictures, ns by its clock: those of their messages."""
@@ -377,17 +377,6 @@ class _Pictures:
         if over > 0:
             places.append(f"{over} pictures have no message and are left out")
         return Damage(self._shown, max(damage.n_lost, bare), damage.bytes_lost, tuple(places))
-
-
-def _nearest(times: np.ndarray, logs: np.ndarray, limit: float) -> np.ndarray:
-    """(K,) for every log time the frame at it, nearer than a limit, ns; -1 for none. Frames rise."""
-    right = np.clip(np.searchsorted(times, logs), 1, max(len(times) - 1, 1))
-    left = right - 1
-    right = np.minimum(right, len(times) - 1)
-    frame = np.where(logs - times[left] < times[right] - logs, left, right)
-    frame = np.where(np.abs(times[frame] - logs) <= limit, frame, -1)
-    taken = np.maximum.accumulate(np.concatenate([[-1], frame[:-1]]))
-    return np.where(frame > taken, frame, -1)
 
 
 def _unreadable(file: Path, error: InputError) -> Damage:
