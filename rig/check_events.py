@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from acino_fte.data_tools.rig_recording import Event
+from acino_fte.rig.check_damage import explain_damage
 from acino_fte.rig.check_types import Gap, StreamAccount
 from acino_fte.rig.check_walk import Findings
 
@@ -10,7 +11,6 @@ _NEAR_NS = 750_000_000  # between an event and what it explains
 _JUMP_S = 0.1  # of the size of a jump
 _LENGTH_S = 0.35  # between two lengths of a silence
 _ENDS_PERIODS, _ENDS_S = 5.0, 0.3  # silence at the start or the end that is told
-_CUT_NS = 2_000_000_000  # before the end of a recording that was cut short: what was still on its way
 _LOSSES = ("stall", "unplugged", "dropped", "lost", "error")
 
 
@@ -57,12 +57,11 @@ def compare_events(found: Findings) -> list[str]:
         return []
     said: list[str] = []
     for event in manifest.events:
-        said += _event(found, event)
-    origin, end = found.span
+        if not _behind(found, event):
+            said += _event(found, event)
+    explain_damage(found)
+    origin = found.span[0]
     for account in found.streams.values():
-        for gap in account.gaps:
-            if manifest.state != "closed" and gap.start_ns > end - _CUT_NS and not gap.explained:
-                gap.explained = "the recording was cut short"
         said += [
             f"{account.name}: {gap.lost} are missing for {gap.seconds:.2f} s from "
             f"{_at(gap.start_ns, origin)} on, and no event tells why"
@@ -82,6 +81,14 @@ def compare_events(found: Findings) -> list[str]:
         if not jump.explained
     ]
     return said + _lens(found) + _counts(found)
+
+
+def _behind(found: Findings, event: Event) -> bool:
+    """Whether a recording was cut short before an event shows in its data."""
+    if found.manifest is None or found.manifest.state == "closed":
+        return False
+    ends = [s.last_ns or 0 for s in found.streams.values() if of_stream(event, s.name)]
+    return max(ends, default=0) < event.time_ns + round(event.seconds * 1e9) + _NEAR_NS
 
 
 def _event(found: Findings, event: Event) -> list[str]:
@@ -129,7 +136,8 @@ def _loss(found: Findings, event: Event, name: str, whose: str) -> list[str]:
         return []
     longest = max(gap.seconds for gap in gaps)
     slack = max(_LENGTH_S, 3 * _period(found.streams[gaps[0].stream]))
-    if abs(longest - event.seconds) > slack:
+    longer_may_be = found.manifest is not None and found.manifest.state == "recovered"
+    if event.seconds - longest > slack or (longest - event.seconds > slack and not longer_may_be):
         return [f"{whose}{name} of {event.seconds:.2f} s: the data show {longest:.2f} s"]
     return []
 
@@ -142,22 +150,22 @@ def _lens(found: Findings) -> list[str]:
     """The lens as the encoders tell it, against the events of the first camera."""
     origin = found.span[0] if found.span else 0
     noted = found.manifest.events if found.manifest is not None else ()
-    events = [event for event in noted if event.kind == "lens_moved"]
+    events = [event for event in noted if event.kind == "lens_moved" and not _behind(found, event)]
     moves = [(one[0], one[1], camera.name) for camera in found.cameras.values() for one in camera.lens]
     said = []
     for event in events:
         if not any(abs(start - event.time_ns) <= _NEAR_NS for start, _, _ in moves):
             said.append(f"lens moved at {_at(event.time_ns, origin)}: the encoders show no such move")
     for start, _, name in moves:
-        if not any(abs(start - event.time_ns) <= _NEAR_NS for event in events):
+        if not any(event.kind == "lens_moved" and abs(start - event.time_ns) <= _NEAR_NS for event in noted):
             said.append(f"{name}: the lens moved at {_at(start, origin)}, and no event tells of it")
     return said
 
 
 def _counts(found: Findings) -> list[str]:
-    """What the manifest says was written, against what is there; only of a recording that was closed."""
+    """What the manifest says was written, against what is there; only of a closed recording that is whole."""
     manifest, said = found.manifest, []
-    if manifest is None or manifest.state != "closed":
+    if manifest is None or manifest.state != "closed" or not found.damage.whole:
         return []
     for stream in manifest.streams:
         name = f"/{stream.name}/image" if stream.kind == "image" else stream.name

@@ -8,6 +8,9 @@ from typing import Literal
 Verdict = Literal["pass", "warn", "fail"]
 _ORDER: tuple[Verdict, ...] = ("pass", "warn", "fail")
 TimeBase = Literal["computer", "device"]
+CUT = "the recording was cut short"
+DAMAGED = "a file is damaged"
+"""What explains a gap besides events."""
 
 
 def length_text(seconds: float) -> str:
@@ -34,7 +37,7 @@ class Gap:
     lost : int
         How many.
     explained : str
-        The event of the manifest that tells of it; empty for none.
+        The event of the manifest that tells of it, :data:`CUT` or :data:`DAMAGED`; empty for none.
     """
 
     stream: str
@@ -137,6 +140,11 @@ class StreamAccount:
     def expected(self) -> int:
         """How many there should be, from the first to the last."""
         return self.count - self.duplicates + self.lost
+
+    @property
+    def cut(self) -> int:
+        """How many are missing at the end because the recording was cut short."""
+        return sum(gap.lost for gap in self.gaps if gap.explained == CUT)
 
     @property
     def lost_share(self) -> float:

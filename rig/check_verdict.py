@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from acino_fte.rig.check_types import (
+    DAMAGED,
     CameraAccount,
     ClockJump,
     Requirement,
@@ -39,6 +40,7 @@ _CABLES = (
     "use the stretches without gaps; look at cable, power and USB port of this device, and at the speed of "
     "the disk (acino-fte doctor)"
 )
+_UNTIL_THEN = "the recorder was stopped by force there: what came before is sound"
 _NETWORK = "give the lidar a network socket of its own, a sound cable and a larger receive buffer"
 
 
@@ -60,7 +62,7 @@ def requirements(found: Findings, unexplained: list[str]) -> list[Requirement]:
         lines += _returns(lidar)
     lines += _warned(found)
     for camera in found.cameras.values():
-        lines += _camera(camera)
+        lines += _camera(camera, found)
     return lines + _overlap(found, streams)
 
 
@@ -145,11 +147,16 @@ def _loss(stream: StreamAccount) -> Requirement:
             f"{stream.lost} of {stream.expected} lost ({100 * stream.lost_share:.2g} %, "
             f"δ_loss = {stream.delta_loss:.5f}), longest gap {length_text(longest)}"
         )
-    explained = sum(gap.lost for gap in stream.gaps if gap.explained)
-    if explained:
-        found += f"; {explained} explained by events"
-    verdict = _limit(stream.lost_share, LOSS_WARN, LOSS_FAIL)
+    damaged = sum(gap.lost for gap in stream.gaps if gap.explained == DAMAGED)
+    noted = sum(gap.lost for gap in stream.gaps if gap.explained) - stream.cut - damaged
+    told = ("explained by events", noted), ("at the end that was cut off", stream.cut)
+    found += "".join(f"; {n} {words}" for words, n in (*told, ("in damaged files", damaged)) if n)
+    verdict = _limit((stream.lost - stream.cut) / max(stream.expected, 1), LOSS_WARN, LOSS_FAIL)
     remedy = _NETWORK if stream.unit == "packages" else _CABLES
+    if stream.cut and verdict == "pass":
+        verdict, remedy = "warn", _UNTIL_THEN
+    elif damaged and stream.lost == damaged + stream.cut:
+        remedy = "use the stretches without gaps; look for a better copy of the damaged files"
     limit = f"0 lost; at most {100 * LOSS_FAIL:.0f} %"
     return Requirement("no loss", stream.name, verdict, found, limit, remedy if verdict != "pass" else "")
 
@@ -284,7 +291,7 @@ def _warned(found: Findings) -> list[Requirement]:
     return out
 
 
-def _camera(camera: CameraAccount) -> list[Requirement]:
+def _camera(camera: CameraAccount, found: Findings) -> list[Requirement]:
     out = []
     name = camera.name
     if camera.n:
@@ -305,11 +312,16 @@ def _camera(camera: CameraAccount) -> list[Requirement]:
             )
         )  # fmt: skip
     if camera.n_without or camera.without_message:
+        images = found.streams.get(f"{name.removesuffix('/info')}/image")
+        missing = camera.n_without - (images.cut if images is not None else 0)
+        recovered = found.manifest is not None and found.manifest.state == "recovered"
+        verdict = _limit(missing / max(camera.n, 1), 0.0, _FEW)
         out.append(
             Requirement(
-                "pictures", name, _limit(camera.n_without / max(camera.n, 1), 0.0, _FEW),
+                "pictures", name, "warn" if verdict == "pass" else verdict,
                 f"{camera.n_without} messages without a picture, "
                 f"{camera.without_message} pictures without a message", "0",
+                "the import takes those that have both" if recovered or not missing else
                 "acino-fte rig recover may save what is in a damaged video",
             )
         )  # fmt: skip
