@@ -2,7 +2,7 @@
 
 The two set-up commands install, which a test must not do; ``.ci/run`` does it, and here only what follows
 ``&&`` runs, in this process (that the script starts as a program is a matter of test_run_cli). The first of
-them draws figures; later runs do without, to save time.
+them draws figures; later runs do without, and comparisons of a whole recording take a part, to save time.
 ``docs/new_species.md``, ``match_tracks.md``, ``moving_cameras.md`` and ``lidar.md`` have tests of their own,
 test_…_tutorial.
 """
@@ -98,6 +98,8 @@ def follow(page: Path, folder: Path) -> None:
                     line = line.partition("&& ")[2].replace("python scripts/run_fte.py", "acino-fte run")
                 elif line.startswith(_NO_FIGURES):
                     line += " --no-figures"
+                elif line.startswith("acino-fte compare ") and "--frames" not in line:
+                    line += " --frames 40:52"
                 execute(line, folder)
         elif language == "python":
             exec(compile(text, f"{page.name}: {text.splitlines()[0]}", "exec"), names)

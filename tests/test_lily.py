@@ -222,14 +222,14 @@ def test_both_lowerings():
 
     Started as a run is, they may end in different local minima of this problem, which is not convex (the
     loss redescends): their barriers take different paths. Therefore both start from the condensed optimum,
-    moved by a seeded random vector of standard deviation 0.01 (rad and m), and go to a tight tolerance. (20
+    moved by a seeded random vector of standard deviation 0.01 (rad and m), and go to a tight tolerance. (12
     of the 110 frames: the explicit model takes a second a frame.)
     """
     pytest.importorskip("casadi")
     from acino_fte.explicit_solve import minimise_explicit
 
     kinematics = load_kinematics(load_skeleton("cheetah"))
-    sequence = load_sequence(FOLDER, species="cheetah", fps=120, frames=(110, 130), likelihood=0.5)
+    sequence = load_sequence(FOLDER, species="cheetah", fps=120, frames=(110, 122), likelihood=0.5)
     problem = build_fte(sequence, kinematics)
     optimum = minimise(problem, initial_trajectory(sequence, kinematics)).q
     begin = problem.clip(optimum + np.random.default_rng(0).normal(0, 0.01, optimum.shape))
