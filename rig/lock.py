@@ -23,7 +23,7 @@ class RigLock:
     Parameters
     ----------
     path : Path
-        The file; it stays when the lock is let go, empty.
+        The file; it goes when the lock is let go, and stays where the process dies.
     recording : Path
         What is recorded, for whoever finds the lock.
 
@@ -45,7 +45,7 @@ class RigLock:
     def __enter__(self) -> RigLock:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            file = _open(self.path)
+            file, held = _taken(self.path)
         except OSError as error:
             raise InputError(
                 "The lock of the rig cannot be made.",
@@ -53,7 +53,6 @@ class RigLock:
                 found=error.strerror or str(error),
                 remedy="where another user's recorder left it: remove the file",
             ) from None
-        held = _hold(file)
         before = _content(file)
         if not held:
             file.close()
@@ -67,10 +66,11 @@ class RigLock:
             rescue = f"; acino-fte rig recover {before.get('recording', 'FOLDER')} rescues what it left"
             self.taken_over = f"the recorder before died without closing: {_sentence(before)}{rescue}"
         self._file = file
-        self._write(
-            {"pid": os.getpid(), "since": datetime.now().isoformat(" ", "seconds"),
-             "recording": str(self.recording.resolve())}
-        )  # fmt: skip
+        with suppress(OSError):  # a full disk: it is held, and says nothing
+            self._write(
+                {"pid": os.getpid(), "since": datetime.now().isoformat(" ", "seconds"),
+                 "recording": str(self.recording.resolve())}
+            )  # fmt: skip
         return self
 
     def _write(self, content: dict[str, Any]) -> None:
@@ -81,15 +81,34 @@ class RigLock:
 
     def __exit__(self, *_: object) -> None:
         if self._file is not None:
-            with suppress(OSError):  # of a full disk: an empty file needs no room
+            with suppress(OSError):  # of another user's file: then it stays, empty
                 self._write({})
+                if os.name != "nt":
+                    self.path.unlink()  # while it is held: see _taken
             self._file.close()
             self._file = None
+            if os.name == "nt":
+                with suppress(OSError):  # another recorder has it open
+                    self.path.unlink()
 
 
 def lock_path(folder: Path, rig: str) -> Path:
     """The lock of the rig of this name among those in a folder."""
     return folder / f"acino-fte-rig-{sha256(rig.encode()).hexdigest()[:12]}.lock"
+
+
+def _taken(path: Path) -> tuple[IO[bytes], bool]:
+    """The file and whether it could be held: the one that has its name now, not one just removed."""
+    while True:
+        file = _open(path)
+        held = _hold(file)
+        try:
+            same = os.path.samestat(os.fstat(file.fileno()), path.stat())
+        except FileNotFoundError:
+            same = False
+        if same:
+            return file, held
+        file.close()
 
 
 def _open(path: Path) -> IO[bytes]:

@@ -29,7 +29,7 @@ from acino_fte.rig.recorder_readers import Reader, ReaderThread
 from acino_fte.rig.recorder_types import Equipment, Status, expected_bytes_per_s, gigabytes
 from acino_fte.rig.rig_file import RigFile
 from acino_fte.rig.sources import Source, SourceStream, camera_topic
-from acino_fte.rig.writers import CameraWriter, SensorWriter
+from acino_fte.rig.writers import CameraWriter, Pace, SensorWriter
 from acino_fte.rig.writers_segments import OpenSegment
 
 TICK_S, FLUSH_S = 0.1, 0.25
@@ -208,7 +208,7 @@ class Recorder:
     ) -> None:
         start = clock.monotonic_ns()
         end = float("inf") if seconds is None else start + round(seconds * 1e9)
-        tick = start
+        tick, pace = start, Pace(self._writers.values())
         while not self._stop:
             reader = min(self._readers, key=Reader.due_ns)
             due = reader.due_ns()
@@ -218,6 +218,7 @@ class Recorder:
             if tick <= due:
                 clock.advance_to(tick)
                 self._tick(tell)
+                pace.tick()
                 tick += round(TICK_S * 1e9)
             else:
                 clock.advance_to(int(due) + 1)

@@ -29,6 +29,7 @@ from acino_fte.rig.recover_types import Salvaged, SavedStream, merged
 _MESSAGES = re.compile(r"messages-(\d+)\.mcap")
 _VIDEO = re.compile(r"(.+)-(\d+)\.(mkv|mp4|avi)")
 _INFO = "/info"
+_FEW = 3  # messages by which streams may end apart
 
 
 @dataclass
@@ -97,7 +98,8 @@ def salvage_recorded(source: Path, target: Path | None, settings: Settings) -> S
     streams = _streams(folder)
     if target is not None and folder.parts:
         write_manifest(target, _manifest(folder, streams))
-    losts = sum(part.found.lost_elsewhere for part in folder.parts)
+    counted = sum(s.lost for s in streams) - sum(s.lost for part in folder.parts for s in part.found.streams)
+    losts = max(sum(part.found.lost_elsewhere for part in folder.parts) - counted, 0)
     return Salvaged(
         "rig recording",
         folder.whole,
@@ -178,12 +180,44 @@ def _missing(folder: _Folder) -> None:
 
 
 def _streams(folder: _Folder) -> tuple[SavedStream, ...]:
-    """Streams of all segments; a video has the name of its camera."""
-    return merged(
-        replace(stream, name=part.camera) if part.camera else stream
-        for part in folder.parts
-        for stream in part.found.streams
-    )
+    """Streams of all segments, with what the manifest knows to be missing; a video is named by its camera."""
+    found = {
+        stream.name: stream
+        for stream in merged(
+            replace(stream, name=part.camera) if part.camera else stream
+            for part in folder.parts
+            for stream in part.found.streams
+        )
+    }
+    before = folder.before
+    if before is None:
+        return tuple(found.values())
+    ends = [s.last_ns + (before.started_ns if _is_video(s) else 0) for s in found.values() if s.last_ns]
+    for known in before.streams:
+        one = found.get(known.name, SavedStream(known.name, "", 0))
+        if known.name in found or known.written:
+            found[known.name] = _compared(one, known, before, max(ends, default=before.started_ns))
+    return tuple(found.values())
+
+
+def _compared(one: SavedStream, known: RecordedStream, before: Manifest, end_ns: int) -> SavedStream:
+    """A stream with what is missing of what the manifest says was written, or at an end that was cut off."""
+    hz = known.expected_hz
+    counted = sum(segment.counts.get(one.name, 0) for segment in before.segments)
+    missing, exact = max(known.written, counted) - one.saved, before.state != "recording"
+    last = (one.last_ns or 0) + (before.started_ns if _is_video(one) else 0)
+    silent = [e for e in before.events if e.kind in ("stall", "unplugged", "error") and e.time_ns >= last]
+    behind = round((end_ns - last) * 1e-9 * hz) - 1 if one.saved and hz else 0
+    if before.state == "recording" and not silent and behind > max(_FEW, missing):
+        missing = behind
+    if missing <= one.lost:
+        return one
+    return replace(one, lost=missing, lost_seconds=missing / hz if hz else 0.0, exact=exact)
+
+
+def _is_video(stream: SavedStream) -> bool:
+    """Whether times are of a video: since the start of the recording. Topics have a slash."""
+    return "/" not in stream.name
 
 
 # The manifest --------------------------------------------------------------------------------------------
@@ -264,7 +298,7 @@ def _recorded(before: Manifest | None, streams: tuple[SavedStream, ...]) -> tupl
 
 
 def _unknown(stream: SavedStream) -> RecordedStream:
-    kind = "image" if "/" not in stream.name else kind_of(stream.type)
+    kind = "image" if _is_video(stream) else kind_of(stream.type)
     rate = (stream.saved - 1) / stream.seconds if stream.seconds > 0 else 0.0
     known = kind if kind != "other" else "image_info"
     return RecordedStream(stream.name, known, round(rate, 3), stream.saved, stream.saved)

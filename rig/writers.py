@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Full, Queue
+from threading import Event as Flag
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
@@ -92,6 +93,17 @@ class SensorWriter(Thread):
         """Write what comes from now on into another segment."""
         self._insist(segment)
 
+    def mark(self) -> Flag:
+        """Put a mark into the queue: it is set when all before it is written."""
+        mark = Flag()
+        self._insist(mark)
+        return mark
+
+    def wait_for(self, mark: Flag) -> None:
+        """Wait until a mark is reached, or writing fails."""
+        while not self.broken and not mark.wait(_PATIENCE_S):
+            continue
+
     def finish(self) -> None:
         """Write what is in the queue and end."""
         self._insist(_STOP)
@@ -106,6 +118,8 @@ class SensorWriter(Thread):
                 if isinstance(item, OpenSegment):
                     self._leave()
                     self._segment = item
+                elif isinstance(item, Flag):
+                    item.set()
                 elif self._segment is not None:
                     self.write(item, self._segment)
             self._leave()
@@ -139,6 +153,20 @@ class SensorWriter(Thread):
     def count(self, stream: str) -> None:
         """One more was written."""
         self.written[stream] = self.written.get(stream, 0) + 1
+
+
+class Pace:
+    """Keeps writers together where time goes as fast as they can: none falls more than two ticks behind."""
+
+    def __init__(self, writers: Iterable[SensorWriter]) -> None:
+        self._writers = list(writers)
+        self._marks: list[tuple[SensorWriter, Flag]] = []
+
+    def tick(self) -> None:
+        """Wait for what was handed over until the tick before."""
+        marks, self._marks = self._marks, [(writer, writer.mark()) for writer in self._writers]
+        for writer, mark in marks:
+            writer.wait_for(mark)
 
 
 class CameraWriter(SensorWriter):

@@ -99,6 +99,17 @@ def test_the_folder_reads_as_one_recording(faulty):
     assert all(stream.received == stream.written for stream in manifest.streams)
 
 
+def test_messages_of_all_streams_lie_together(faulty):
+    """On the virtual clock too: where a file is cut, all streams end within a quarter of a second."""
+    from mcap.reader import NonSeekingReader
+
+    for path in faulty[0].glob("messages-*.mcap"):
+        with path.open("rb") as file:
+            found = NonSeekingReader(file).iter_messages(log_time_order=False)
+            logs = np.array([message.log_time for _, _, message in found])
+        assert (np.maximum.accumulate(logs) - logs).max() < 0.25e9, path
+
+
 def test_counts_of_the_encoders_come_with_every_image(faulty):
     folder, _, manifest, _ = faulty
     with open_recording(folder) as reader:

@@ -1,6 +1,7 @@
 """Parts of the recorder: watches over streams, clocks, faults, the lock, drivers and video."""
 
 import os
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -172,6 +173,30 @@ def test_one_recorder_for_a_rig(tmp_path):
     path.write_text("{not whole")
     with RigLock(path, tmp_path / "fifth") as fifth:
         assert "died without closing" in fifth.taken_over
+
+
+def test_no_lock_is_left_and_none_is_held_twice(tmp_path):
+    """Ten threads, each time a file that another one is about to remove."""
+    path, inside, taken, most = tmp_path / "rig.lock", [], [], []
+
+    def take():
+        for _ in range(60):
+            try:
+                with RigLock(path, tmp_path):
+                    inside.append(1)
+                    most.append(len(inside))
+                    inside.pop()
+                    taken.append(1)
+            except InputError:
+                continue
+
+    threads = [Thread(target=take) for _ in range(10)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert max(most) == 1 and taken
+    assert not list(tmp_path.iterdir())
 
 
 def test_two_sessions_of_a_rig_cannot_record_at_once(tmp_path):

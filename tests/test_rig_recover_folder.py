@@ -169,6 +169,11 @@ def test_cut_segments(closed, cut, tmp_path):
         counted = {stream.name: stream.count for stream in reader.streams}
         infos = sum(1 for _ in reader.records(kinds={"image_info"}))
     assert infos == counted["/cam1/info"] == sum(s.counts.get("/cam1/info", 0) for s in manifest.segments)
+    for stream in read_manifest(folder).streams:  # what it says was written, and is not there
+        (saved,) = (s for s in found.streams if s.name == stream.name)
+        assert saved.saved + saved.lost == stream.written
+        assert saved.lost_seconds == pytest.approx(saved.lost / stream.expected_hz)
+    assert found.lost > 0
     report = json.loads((found.copy / "recovery.json").read_text())
     assert report["saved"] == found.saved and not report["whole"]
     again = recover(found.copy)
@@ -197,6 +202,7 @@ def test_a_segment_that_is_missing_or_empty(closed, tmp_path):
     found = recover(folder)
     assert_consistent(found.copy)
     notes = " ".join(found.notes)
+    assert all(stream.lost > stream.saved / 3 for stream in found.streams)
     assert "messages-0001.mcap is not there" in notes and "cam1-0001.mkv: nothing can be saved" in notes
     for file in folder.glob("*-000?.m*"):
         file.write_bytes(bytes(500))
