@@ -199,12 +199,13 @@ def _enter(simulated: bool) -> None:
 
 @contextmanager
 def _ends_by_signal() -> Iterator[None]:
-    """A terminal that is closed and a polite kill end the loop as Ctrl-C does."""
+    """A terminal that is closed, a polite kill, Ctrl-Z and Ctrl-\\ end the loop as Ctrl-C does."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    signals = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+    names = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")  # a program that is put aside would drive on
+    signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
     before = [signal.signal(number, stop) for number in signals]
     try:
         yield

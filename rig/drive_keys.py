@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import sys
 from contextlib import suppress
@@ -21,6 +22,7 @@ _SEQUENCES = {
     "\x1bOC": "right",
     "\x1bOD": "left",
 }
+_BEGUN = re.compile(rb"\x1b(?:O|\[[0-9;?]*)?$")
 
 
 def keys_in(text: str) -> list[str]:
@@ -57,6 +59,7 @@ class Keyboard:
     def __init__(self) -> None:
         self._before: list[Any] | None = None
         self._fd = -1
+        self._begun = b""
 
     def __enter__(self) -> Keyboard:
         if not (sys.stdin.isatty() and sys.stdout.isatty()):
@@ -72,6 +75,9 @@ class Keyboard:
         self._fd = sys.stdin.fileno()
         self._before = termios.tcgetattr(self._fd)
         tty.setcbreak(self._fd)
+        raw = termios.tcgetattr(self._fd)
+        raw[0] &= ~termios.IXON  # Ctrl-S would hold up the screen, and with it the loop
+        termios.tcsetattr(self._fd, termios.TCSANOW, raw)
         return self
 
     def __exit__(
@@ -85,7 +91,17 @@ class Keyboard:
 
     def read(self) -> list[str]:
         """Keys since the last time; ``"q"`` when the terminal is gone."""
+        begun, self._begun = self._begun, b""
         if not select.select([self._fd], [], [], 0)[0]:
-            return []
+            return ["escape"] if begun == b"\x1b" else []
         data = os.read(self._fd, 1024)
-        return keys_in(data.decode("utf-8", "replace")) if data else ["q"]
+        if not data:
+            return ["q"]
+        whole, self._begun = split_keys(begun + data)
+        return keys_in(whole.decode("utf-8", "replace"))
+
+
+def split_keys(data: bytes) -> tuple[bytes, bytes]:
+    """What is whole, and the beginning of an escape sequence whose rest has not come yet."""
+    begun = _BEGUN.search(data)
+    return (data[: begun.start()], data[begun.start() :]) if begun else (data, b"")

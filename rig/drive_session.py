@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from acino_fte.rig.encoders import Encoder, Reading, ReportedCounts
+from acino_fte.rig.encoders import Encoder, LineCounts, Reading, ReportedCounts
 from acino_fte.rig.encoders_shared import CountsWriter
 from acino_fte.rig.encoders_store import PositionStore
 from acino_fte.rig.joystick import Joystick
@@ -147,6 +147,7 @@ class DriveSession:
 
     def close(self, wait: Callable[[float], None] = time.sleep) -> None:
         """Stop the motors, store the positions where they came to rest, close the line."""
+        began = self._clock()
         try:
             self.stop()
             for _ in range(5):  # a command may be lost; the last counts may be on their way
@@ -156,7 +157,7 @@ class DriveSession:
         finally:
             for axis in self.axes:
                 if axis.encoder is not None:
-                    axis.encoder.save(at_rest=True)
+                    axis.encoder.save_last(began)
             self.link.close()
             if self._shared:
                 self._shared.close()
@@ -179,9 +180,13 @@ class DriveSession:
         for axis in self.axes:
             if axis.encoder is not None:
                 axis.encoder.poll(now_ns)
-        if self._shared:
-            counts = [axis.encoder.counts if axis.encoder else None for axis in self.axes]
-            self._shared.write([count or 0 for count in counts], now_ns)
+                if isinstance(axis.encoder.source, LineCounts):
+                    axis.trouble = axis.encoder.source.trouble
+                    if axis.trouble:
+                        axis.encoder.interrupted(restarted=True)
+        encoders = [axis.encoder for axis in self.axes]
+        if self._shared and not any(part and (part.in_doubt or part.counts is None) for part in encoders):
+            self._shared.write([(part.counts or 0) if part else 0 for part in encoders], now_ns)
 
     def _listen(self, now_ns: int) -> None:
         """Reports of the microcontroller; whether it was gone."""
@@ -193,7 +198,7 @@ class DriveSession:
                     axis.report.put(message.count, now_ns)
                     if axis.report.restarted:
                         axis.report.restarted = False
-                        axis.encoder.interrupted()
+                        axis.encoder.interrupted(restarted=True)
                         self._note = "the microcontroller started again: home the rings (h h)"
         if self.link.interruptions != self._interruptions:
             self._interruptions = self.link.interruptions
@@ -294,6 +299,8 @@ class DriveSession:
         link = self.link
         if not link.connected:
             return f"not connected: {link.trouble}; it goes on by itself when it is", False
+        if link.foreign:
+            return "what comes is not understood: is this the microcontroller? (--port)", False
         if not link.ready:
             return "listening to the microcontroller", False
         if link.heard_ns is None or now_ns - link.heard_ns > 1_000_000_000:

@@ -22,8 +22,12 @@ REST_NS = 500_000_000
 RUN_ON, FROM_ZERO = 1500, 5
 """A counter that went on through an interruption is within the first of where it was: the motor ran on until
 its dead-man. One within the second of 0 has started again, unless it was there before."""
-_NEAR, _FASTEST = 500, 20_000.0
-"""Counts, and counts a second, by which reports can differ."""
+_NEAR, _FASTEST, _RUNS_S = 500, 20_000.0, 0.25
+"""Counts, and counts a second, by which reports can differ; a motor without commands has stopped after the
+third."""
+_PAUSE_S, _MOVED = 0.1, 20
+"""A counter that comes back from so long a silence within FROM_ZERO of 0, and from further away than the
+second, has started again: a microcontroller needs that long to start."""
 
 
 class CountSource(Protocol):
@@ -40,6 +44,10 @@ class CountSource(Protocol):
     def index_position(self) -> int | None:
         """Raw counts at the last pulse of the index, None without one."""
 
+    @property
+    def heard_ns(self) -> int | None:
+        """When it last said something; None for one that always knows, or has said nothing yet."""
+
 
 class LineCounts:
     """Counts of an encoder on two or three pins.
@@ -52,15 +60,23 @@ class LineCounts:
         Filter of the decoder, see :class:`acino_fte.rig.quadrature.EdgeDecoder`.
     """
 
+    heard_ns = None
+
     def __init__(self, lines: EdgeInput, *, min_pulse_ns: int = 0) -> None:
         self._lines = lines
         self._decoder = EdgeDecoder(lines.levels, min_pulse_ns=min_pulse_ns)
         self.index_position: int | None = None
         self.lost = 0
+        self.trouble = ""
 
-    def poll(self) -> int:
-        """Counts now."""
-        batch = self._lines.read()
+    def poll(self) -> int | None:
+        """Counts now; None, and `trouble` says why, where the lines cannot be read any more."""
+        try:
+            batch = self._lines.read()
+        except OSError as error:  # as of a chip on USB that was pulled; the rings are driven on
+            self.trouble = f"its lines cannot be read: {error.strerror or error}"
+            return None
+        self.trouble = ""
         self.lost += batch.lost
         found = self._decoder.feed(batch.edges, batch.until_ns)
         if len(found.index_position):
@@ -90,7 +106,7 @@ class ReportedCounts:
         self.counts: int | None = None
         self.glitches = Glitches()
         self.restarted = False
-        self._when_ns = 0
+        self.heard_ns: int | None = None
         self._odd: int | None = None
 
     def poll(self) -> int | None:
@@ -107,18 +123,26 @@ class ReportedCounts:
         now_ns : int
             By the clock of the loop.
         """
-        near = _NEAR + _FASTEST * (now_ns - self._when_ns) * 1e-9
-        if self.counts is not None and abs(counts - self.counts) > near:
+        passed = 0.0 if self.heard_ns is None else max(now_ns - self.heard_ns, 0) * 1e-9
+        near = _NEAR + _FASTEST * min(passed, _RUNS_S)
+        if self.counts is not None and self._is_odd(counts, near, passed):
             if self._odd is None or abs(counts - self._odd) > near:
                 self._odd = counts
                 self.glitches += Glitches(illegal=1)
                 return
             self.restarted = True
-        self.counts, self._when_ns, self._odd = counts, now_ns, None
+        self.counts, self.heard_ns, self._odd = counts, now_ns, None
+
+    def _is_odd(self, counts: int, near: float, passed_s: float) -> bool:
+        """Whether the motor cannot have gone there, or the counter looks as if it began again."""
+        moved = abs(counts - (self.counts or 0))
+        if self._odd is not None and abs(counts - self._odd) < moved:
+            return True
+        return moved > near or (passed_s > _PAUSE_S and abs(counts) <= FROM_ZERO and moved > _MOVED)
 
     def forget(self) -> None:
         """The microcontroller is gone: nothing is known until it reports again."""
-        self.counts, self._odd, self.restarted = None, None, False
+        self.counts, self._odd, self.restarted, self.heard_ns = None, None, False, None
 
 
 @dataclass(frozen=True)
@@ -182,7 +206,8 @@ class Encoder:
         self._sure_at_start = bool(stored and stored.at_rest and stored.sure and self_locking)
         self._offset: int | None = None
         self._index_seen: int | None = None
-        self._doubt = False
+        self._doubt, self._restarted = False, False
+        self._heard_before: int | None = None
         self._history: deque[tuple[int, int]] = deque()
         self._moved_ns, self._resting = 0, True
 
@@ -195,14 +220,14 @@ class Encoder:
             By the clock of the program (monotonic).
         """
         raw = self.source.poll()
-        if raw is None:
+        if raw is None or self._is_old():
             return self.reading()
         if self._offset is None:
             self._offset = self._last_known - raw
             self.sure = self._sure_at_start
         elif self._doubt:
             self._take_up(raw)
-        self._doubt = False
+        self._doubt = self._restarted = False
         self._use_index()
         self._remember(raw + self._offset, now_ns)
         return self.reading()
@@ -224,7 +249,17 @@ class Encoder:
         """The last reading."""
         counts = self.counts
         turned = float("nan") if counts is None else float(angle(counts, self.counts_per_turn))
-        return Reading(counts, turned, self.velocity, self.sure, self.source.glitches)
+        return Reading(counts, turned, self.velocity, self.certain, self.source.glitches)
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the source was gone and has not said since where the shaft is."""
+        return self._doubt
+
+    @property
+    def certain(self) -> bool:
+        """Whether both the zero and the counts hold."""
+        return self.sure and not self._doubt
 
     def zero(self, counts: int = 0) -> None:
         """From now on, where the shaft stands is called this."""
@@ -238,9 +273,21 @@ class Encoder:
         self.sure = self._zero_known = True
         self.save(at_rest=self._resting)
 
-    def interrupted(self) -> None:
-        """The source was gone, as a microcontroller that was unplugged: its counter may start from 0."""
-        self._doubt = True
+    def interrupted(self, *, restarted: bool = False) -> None:
+        """The source was gone, as a microcontroller that was unplugged: its counter may start from 0.
+
+        Parameters
+        ----------
+        restarted : bool
+            It is known to have started again.
+        """
+        self._doubt, self._restarted = True, self._restarted or restarted
+        self._heard_before = self.source.heard_ns
+
+    def _is_old(self) -> bool:
+        """Whether the source has said nothing since it was interrupted."""
+        heard = self.source.heard_ns
+        return self._doubt and not self._restarted and heard is not None and heard == self._heard_before
 
     def save(self, *, at_rest: bool) -> None:
         """Store the position."""
@@ -248,13 +295,25 @@ class Encoder:
             index = self._index_at if self._zero_known else None
             self._store.put(self.name, Stored(self.counts, at_rest, self.sure, index))
 
+    def save_last(self, since_ns: int) -> None:
+        """Store the position for good: at rest only where the source told where the shaft came to rest.
+
+        Parameters
+        ----------
+        since_ns : int
+            When the motor was told to stop.
+        """
+        heard = self.source.heard_ns
+        told = self._resting or heard is None or heard > since_ns
+        self.save(at_rest=told and not self._doubt)
+
     def _take_up(self, raw: int) -> None:
         """After an interruption: the counter went on, or began again where the shaft stood."""
         if self._offset is None or self.counts is None:
             return
         before = self.counts - self._offset
         started_again = abs(raw) <= FROM_ZERO < abs(before)
-        if started_again or abs(raw - before) > RUN_ON:
+        if self._restarted or started_again or abs(raw - before) > RUN_ON:
             self._offset, self.sure = self.counts - raw, False
 
     def _use_index(self) -> None:

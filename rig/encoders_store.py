@@ -14,6 +14,7 @@ from acino_fte.errors import InputError
 
 FORMAT = "acino-fte/rig-positions/1"
 FILE_NAME = "positions.json"
+MAX_COUNTS = 2**53
 
 
 @dataclass(frozen=True)
@@ -125,4 +126,8 @@ def _stored(item: dict[str, Any]) -> Stored:
     numbers = [stored.counts, *([] if stored.index_at is None else [stored.index_at]), *(stored.limits or ())]
     if not all(type(number) is int for number in numbers):
         raise TypeError("counts must be whole numbers")
+    if max(map(abs, numbers)) > MAX_COUNTS or not (type(stored.at_rest) is type(stored.sure) is bool):
+        raise ValueError("impossible counts, or marks that are neither true nor false")
+    if stored.limits is not None and not (len(stored.limits) == 2 and stored.limits[0] < stored.limits[1]):
+        raise ValueError("impossible ends of the travel")
     return stored

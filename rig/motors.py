@@ -6,6 +6,7 @@ the travel, and a ramp. A stop is never ramped. Power is -1 … 1, positive wher
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -15,7 +16,7 @@ from acino_fte.rig.serial_frames import MAX_SPEED
 
 DEAD_MAN_S = 0.12
 """Of either side of the line. With the loop's period and the motor's own stopping it stays below 0.2 s."""
-Fault = Literal["", "stalled", "turns the wrong way"]
+Fault = Literal["", "stalled", "turns the wrong way", "no counts come"]
 
 
 class MotorOutput(Protocol):
@@ -34,7 +35,7 @@ class HBridge:
 
     def set(self, power: float) -> None:
         """Power from now on."""
-        power = max(-1.0, min(1.0, power))
+        power = possible(power)
         forward = power > 0 if power else self._forward
         if forward != self._forward:
             self._pins.set(self._forward, 0.0)
@@ -56,7 +57,12 @@ class LinkOutput:
 
     def set(self, power: float) -> None:
         """Power from now on."""
-        self.speed = round(max(-1.0, min(1.0, power)) * MAX_SPEED)
+        self.speed = round(possible(power) * MAX_SPEED)
+
+
+def possible(power: float) -> float:
+    """The power within -1 … 1; what is no number is 0, and never the full power that ``min`` makes of it."""
+    return max(-1.0, min(1.0, power)) if math.isfinite(power) else 0.0
 
 
 @dataclass(frozen=True)
@@ -83,6 +89,8 @@ class MotorSettings:
         It is stalled if it moves less than this in this time, at more than `creep`.
     reversed_counts : float
         It turns the wrong way if it moves this much against its power in the same time.
+    silent_s : float
+        It stops if it has power and the microcontroller has reported nothing for this long.
     """
 
     dead_man_s: float = DEAD_MAN_S
@@ -95,6 +103,7 @@ class MotorSettings:
     stall_s: float = 0.3
     stall_counts: float = 5.0
     reversed_counts: float = 50.0
+    silent_s: float = 0.2
 
 
 class MotorControl:
@@ -127,11 +136,12 @@ class MotorControl:
         self._blocked = 0
         self._updated_ns: int | None = None
         self._watched: tuple[int, int, int] | None = None
+        self._powered_ns: int | None = None
 
     @property
     def homed(self) -> bool:
         """Whether the ends of the travel are known and hold."""
-        return self.limits is not None and self.encoder.sure
+        return self.limits is not None and self.encoder.certain
 
     def command(self, power: float, now_ns: int) -> None:
         """What the operator wants, to be said again before `dead_man_s` is over.
@@ -143,7 +153,7 @@ class MotorControl:
         now_ns : int
             By the clock of the loop (monotonic).
         """
-        self._wish, self._wish_ns = max(-1.0, min(1.0, power)), now_ns
+        self._wish, self._wish_ns = possible(power), now_ns
 
     def stop(self) -> None:
         """At once."""
@@ -151,8 +161,8 @@ class MotorControl:
         self._set(0.0)
 
     def alive(self, now_ns: int) -> bool:
-        """Whether a command came recently enough."""
-        return now_ns - self._wish_ns < self.settings.dead_man_s * 1e9
+        """Whether a command came recently enough; never by a clock that went back."""
+        return 0 <= now_ns - self._wish_ns < self.settings.dead_man_s * 1e9
 
     def update(self, now_ns: int) -> float:
         """Drive the motor, at least every 20 ms.
@@ -163,12 +173,15 @@ class MotorControl:
             The power that it got.
         """
         wish = self._wish if self.alive(now_ns) else 0.0
+        passed = 0.0 if self._updated_ns is None else (now_ns - self._updated_ns) * 1e-9
+        self._updated_ns = now_ns
+        if not 0 <= passed <= self.settings.dead_man_s:  # the loop hung: what it drives has stopped meanwhile
+            self.power, self._watched, passed = 0.0, None, 0.0
+        self._listen(now_ns)
         self._watch(now_ns)
         if wish == 0.0 or self.fault:
             self._release(wish)
         target = 0.0 if self._is_blocked(wish) else self._limited(wish)
-        passed = 0.0 if self._updated_ns is None else (now_ns - self._updated_ns) * 1e-9
-        self._updated_ns = now_ns
         self._set(self._ramped(target, passed))
         return self.power
 
@@ -183,7 +196,7 @@ class MotorControl:
     def _limited(self, wish: float) -> float:
         """The wish within the ends of the travel; slower before them."""
         counts = self.encoder.counts
-        if self.limits is None or not self.encoder.sure or counts is None:
+        if self.limits is None or not self.homed or counts is None:
             return max(-self.settings.unhomed, min(self.settings.unhomed, wish))
         left = self.limits[1] - counts if wish > 0 else counts - self.limits[0]
         if left <= 0:
@@ -196,8 +209,20 @@ class MotorControl:
         power = self.power if self.power * target > 0 else 0.0
         if abs(target) <= abs(power):
             return target
-        most = abs(power) + max(passed_s / self.settings.ramp_s, 0.0)
+        most = abs(power) + passed_s / self.settings.ramp_s
         return max(-most, min(most, target))
+
+    def _listen(self, now_ns: int) -> None:
+        """Whether counts come while it has power: without them nothing says where it is."""
+        if not self.power:
+            self._powered_ns = None
+            return
+        if self._powered_ns is None:
+            self._powered_ns = now_ns
+        heard = self.encoder.source.heard_ns
+        if heard is not None and now_ns - max(heard, self._powered_ns) >= self.settings.silent_s * 1e9:
+            self.encoder.interrupted()
+            self._fail("no counts come", 0)
 
     def _watch(self, now_ns: int) -> None:
         """Whether it moves, and the right way, while it has power."""
@@ -212,6 +237,8 @@ class MotorControl:
         moved = (counts - start) * sign
         if moved <= -self.settings.reversed_counts:
             self._fail("turns the wrong way", sign)
+        elif self.fault:
+            return
         elif now_ns - since >= self.settings.stall_s * 1e9:
             self._watched = now_ns, counts, sign
             if moved < self.settings.stall_counts:

@@ -29,6 +29,7 @@ class Homing:
         self._motor = motor
         self._began_ns = now_ns
         motor.stop()
+        motor.update(now_ns)  # a stall from before is not a stop that was met
         motor.limits = None
 
     @property
@@ -45,7 +46,8 @@ class Homing:
         if (
             now_ns - self._began_ns > TIMEOUT_S * 1e9
             or counts is None
-            or motor.fault == "turns the wrong way"
+            or motor.fault in ("turns the wrong way", "no counts come")
+            or motor.encoder.in_doubt
         ):
             self.cancel()
         elif self.phase == "to the low end":

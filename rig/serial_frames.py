@@ -132,7 +132,7 @@ class LineReader:
         return [line for line in lines if line]
 
     def clear(self) -> None:
-        """Forget a line that was begun, and do not trust the rest of it: the cable was out."""
+        """Forget a line that was begun: the cable was out. Its rest alone is no message."""
         self._part.clear()
         self._skipping = False
 

@@ -1,8 +1,9 @@
 """The line to the microcontroller: found, read and written without waiting, opened again after an unplug.
 
 Which protocol the device speaks is heard, not asked: the host listens to both, and takes the one in which
-three messages have come. It says nothing before that, or before two seconds of silence; then it speaks plain
-lines, and a framed device ignores them.
+three messages have come. It says nothing before that, or before two seconds in which nothing came at all;
+then it speaks plain lines, and a framed device ignores them. To a device that talks and is not understood, as
+a receiver for satellites, it never says anything.
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ class SerialPort:
         self.path = path
         try:
             self._serial = serial.Serial(path, BAUD, timeout=0, write_timeout=0.05, exclusive=True)
-        except ValueError as error:
+        except OSError:
+            raise
+        except Exception as error:  # noqa: BLE001 - a cable pulled just now raises termios.error, which is none
             raise OSError(str(error)) from None
 
     def read(self) -> bytes:
@@ -91,7 +94,7 @@ class SerialLink:
         self._lines: Lines | None = None if framed is None else self._candidates[0 if framed else 1]
         self._port: Port | None = None
         self._tried_ns: int | None = None
-        self._opened_ns = 0
+        self._byte_ns = 0
         self.heard_ns: int | None = None
         self.interruptions = 0
         self.trouble = "not opened yet"
@@ -105,6 +108,12 @@ class SerialLink:
     def ready(self) -> bool:
         """Whether commands can be sent."""
         return self.connected and self._lines is not None
+
+    @property
+    def foreign(self) -> bool:
+        """Whether something comes, and none of it is a message."""
+        junk = min(lines.counts.refused for lines in self._candidates)
+        return self.ready is False and self.heard_ns is None and junk >= _HEARD
 
     @property
     def protocol(self) -> str:
@@ -162,13 +171,15 @@ class SerialLink:
             messages += lines.feed(data, now_ns)
             if lines.counts.accepted >= _HEARD and self._lines is None:
                 self._lines = lines
-        silent = not messages and self.heard_ns is None and now_ns - self._opened_ns >= LISTEN_NS
+        if data:
+            self._byte_ns = now_ns
+        silent = not messages and self.heard_ns is None and now_ns - self._byte_ns >= LISTEN_NS
         if self._lines is None and silent:
             self._lines = self._candidates[1]
         return messages
 
     def _open(self, now_ns: int) -> bool:
-        if self._tried_ns is not None and now_ns - self._tried_ns < RETRY_NS:
+        if self._tried_ns is not None and 0 <= now_ns - self._tried_ns < RETRY_NS:
             return False
         self._tried_ns = now_ns
         try:
@@ -177,7 +188,7 @@ class SerialLink:
             self.trouble = _short(error)
             return False
         self.trouble = ""
-        self._opened_ns = now_ns
+        self._byte_ns = now_ns
         for lines in self._candidates:
             lines.interrupted()
         return True

@@ -4,10 +4,11 @@ import io
 import json
 
 import pytest
+import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from acino_fte.cli import app
+from acino_fte.cli_rig_drive import drive
 from acino_fte.errors import InputError
 from acino_fte.rig import drive_setup
 from acino_fte.rig.drive_keys import keys_in
@@ -302,7 +303,9 @@ def command(tmp_path, monkeypatch):
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [])
     monkeypatch.setattr("acino_fte.cli_rig_drive._STATUS_S", 0.3)
     monkeypatch.chdir(tmp_path)
-    return lambda *words: CliRunner().invoke(app, ["rig", "drive", *words])
+    app = typer.Typer()
+    app.command("drive")(drive)
+    return lambda *words: CliRunner().invoke(app, list(words))
 
 
 def test_the_command(command, tmp_path, monkeypatch):
