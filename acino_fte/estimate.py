@@ -242,7 +242,8 @@ class _Estimate:
         The noise comes first: sides are judged by it, and a table that is too small exaggerates the evidence.
         """
         self._measure(problem, minimum, spread)
-        self.fuse.look(problem.positions(minimum.q, minimum.theta), (problem.parameters, minimum.theta))
+        positions = problem.positions(minimum.q, minimum.theta)
+        self.fuse.look(positions, (problem.parameters, minimum.theta), spread)
         self.assumed = replace(self.assumed, depth=self.fuse.data)
         changed = self.options.swaps and self._assign(problem, minimum)
         if changed:

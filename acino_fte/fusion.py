@@ -18,6 +18,7 @@ from acino_fte.cameras import Camera
 from acino_fte.depth import BodyReturns, DepthData, MarkerDepths, expected_surface
 from acino_fte.noise import PRIOR_COUNT, robust_scale
 from acino_fte.parameters import Parameters
+from acino_fte.posterior import MOST_LEVERAGE, Posterior
 from acino_fte.prediction import corrected_cameras, positions_at, time_offsets
 from acino_fte.sequence import Sequence
 from acino_fte.skeleton import Skeleton
@@ -101,8 +102,16 @@ class Fusion:
         if sequence.lidar is not None:
             self._pixels = pixels[:, sequence.cameras.names.index(sequence.lidar.camera)]
 
-    def look(self, positions: np.ndarray, found: tuple[Parameters, np.ndarray] | None) -> None:
-        """Associate again: markers are at `positions` (N, M, 3), m, and θ of a fit is `found`."""
+    def look(
+        self,
+        positions: np.ndarray,
+        found: tuple[Parameters, np.ndarray] | None,
+        spread: Posterior | None = None,
+    ) -> None:
+        """Associate again.
+
+        Markers are at `positions` (N, M, 3), m; θ of a fit is `found`, and its posterior `spread`.
+        """
         if not self.used:
             return
         if found is not None:
@@ -122,7 +131,7 @@ class Fusion:
             late=late,
         )
         if data is not None and found is not None and self.how == "marker":
-            self.factor = self._scale(data, positions, found)
+            self.factor = self._scale(data, positions, found, spread)
             data = replace(data, measured=replace(data.measured, sd=self.factor * data.measured.sd))
         self.data = data
 
@@ -140,14 +149,43 @@ class Fusion:
             return cameras[name], 0.0
         return corrected_cameras(cameras, *found)[name], time_offsets(cameras, *found)[name]
 
-    def _scale(self, data: DepthData, positions: np.ndarray, found: tuple[Parameters, np.ndarray]) -> float:
-        """Scale of the residuals in units of their standard deviations; the table counts like 20 depths."""
+    def _scale(
+        self,
+        data: DepthData,
+        positions: np.ndarray,
+        found: tuple[Parameters, np.ndarray],
+        spread: Posterior | None,
+    ) -> float:
+        """Scale of the residuals in units of their standard deviations; the table counts like 20 depths.
+
+        A fit takes its share of the noise: a residual has (1 − h) σ² of it, with the leverage h.
+        """
         residuals = self._residuals(data, positions, found)
-        scale = robust_scale(residuals.residual / residuals.sd)
+        free = 1.0
+        if spread is not None:
+            variance = self._predicted_variance(residuals, found, spread)
+            free = np.sqrt(1.0 - np.clip(variance / residuals.sd**2, 0.0, MOST_LEVERAGE))
+        scale = robust_scale(residuals.residual / (residuals.sd * free))
         if not scale > 0:
             return self.factor
         count = len(residuals.sd)
         return float(np.clip(math.exp(count * math.log(scale) / (count + PRIOR_COUNT)), *_FACTORS))
+
+    def _predicted_variance(
+        self, residuals: DepthResiduals, found: tuple[Parameters, np.ndarray], spread: Posterior
+    ) -> np.ndarray:
+        """Variance (K,), m², of the predicted depths: zᵀ cov(p) z + var(o) − 2 zᵀ cov(p, o)."""
+        frame, marker = residuals.frame, residuals.marker
+        rotation = self._camera(found)[0].rotation
+        axis = np.broadcast_to(rotation, (len(spread.positions), 3, 3))[frame, 2]
+        variance = np.einsum("ka,kab,kb->k", axis, spread.positions[frame, marker], axis)
+        places = found[0].of_family("surface")
+        if len(places):
+            place = places[marker]
+            first = len(spread.theta) - spread.with_cameras.shape[-1]
+            mixed = spread.with_cameras[frame, marker, :, place - first]
+            variance += spread.theta[place, place] - 2.0 * np.einsum("ka,ka->k", axis, mixed)
+        return variance
 
     def _residuals(
         self, data: DepthData, positions: np.ndarray, fit: tuple[Parameters, np.ndarray]
