@@ -220,7 +220,7 @@ def _conclude(session: Session, manifest: Manifest, seconds: float | None, quiet
         stdout.print(f"written to {session.folder}" + (f"; {look}" if whole else ""), markup=False)
     if not whole:
         remedy = f"acino-fte rig recover {session.folder} rescues it"
-        warn(f"not all could be closed; {remedy} {unwritten}".strip())
+        warn("; ".join(filter(None, ["not all could be closed", unwritten, remedy])))
     early = any(event.kind in ("disk_full", "error") for event in manifest.events)
     if bad or not whole or (early and seconds is not None and lasted < seconds - 1):
         raise typer.Exit(EXIT_OTHER)

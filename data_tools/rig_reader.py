@@ -83,6 +83,7 @@ class RigReader:
                 found="neither",
             )
         self._losses: dict[str, Damage] = {}
+        self._closed: dict[str, Damage] = {}  # videos that cannot be opened
         self._rows: dict[tuple[int, str], np.ndarray] = {}
         self._known: dict[int, tuple[Stream, ...]] = {}
         self._lengths: dict[Path, np.ndarray] = {}
@@ -146,7 +147,7 @@ class RigReader:
     @property
     def damage(self) -> Damage:
         """What was lost so far; complete once all records were read."""
-        parts = {**self._missing(), **self._losses}
+        parts = {**self._missing(), **self._closed, **self._losses}
         places = [f"{name}: {place}" for name, part in parts.items() for place in part.places]
         if len(places) > _PLACES:
             places[_PLACES:] = [f"and {len(places) - _PLACES} more places"]
@@ -233,7 +234,7 @@ class RigReader:
                 with VideoReader(file) as video:
                     self._lengths[file] = video.stamps_ns
             except InputError as error:
-                self._lose(file.name, _unreadable(file, error))
+                self._closed[file.name] = _unreadable(file, error)
                 self._lengths[file] = np.zeros(0, np.int64)
         return self._lengths[file]
 

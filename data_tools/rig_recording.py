@@ -156,7 +156,16 @@ def read_manifest(folder: Path) -> Manifest:
         ) from None
     except ValueError as error:
         raise _wrong(path, str(error)) from None
-    if not isinstance(content, dict) or content.pop("format", None) != FORMAT:
+    form = content.pop("format", None) if isinstance(content, dict) else None
+    if form != FORMAT:
+        if isinstance(form, str) and form.startswith(FORMAT.rpartition("/")[0] + "/"):
+            raise InputError(
+                "The recording's manifest is of another version.",
+                file=path,
+                expected=FORMAT,
+                found=form,
+                remedy="use the version of acino-fte that recorded it, or a newer one",
+            )
         raise _wrong(path, "another format")
     try:
         return Manifest(**{key: _value(key, value) for key, value in content.items()})

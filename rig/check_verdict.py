@@ -82,9 +82,11 @@ def _readable(found: Findings) -> Requirement:
     if damage.whole:
         return Requirement("readable", "the files", "pass", "everything", "everything")
     shown = "; ".join(damage.places[:2]) + ("; …" if len(damage.places) > 2 else "")
+    recovered = found.manifest is not None and found.manifest.state == "recovered"
     return Requirement(
         "readable", "the files", "fail" if share > _FEW else "warn",
         f"{damage.n_lost} messages lost, {damage.bytes_lost} bytes skipped ({shown})", "everything",
+        "this is the rescued copy: what can be read is all there is" if recovered and not damage.n_lost else
         "acino-fte rig recover makes a sound copy of what is left; copy it again if the original is better",
     )  # fmt: skip
 
@@ -92,7 +94,7 @@ def _readable(found: Findings) -> Requirement:
 def _closed(found: Findings) -> Requirement:
     if found.manifest is None:
         return Requirement(
-            "closed", "the recording", "warn", "its manifest is lost or damaged", "closed",
+            "closed", "the recording", "warn", "its manifest is lost, damaged or of another version", "closed",
             "what the recorder noted is not known; acino-fte rig recover makes a new manifest",
         )  # fmt: skip
     state = found.manifest.state

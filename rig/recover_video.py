@@ -184,7 +184,7 @@ def _remuxed(av: Any, container: Any, target: Path, form: str, notes: list[str])
             streams = {}
             for stream in container.streams:
                 if stream.type in ("video", "audio"):
-                    streams[stream.index] = out.add_stream_from_template(stream)
+                    streams[stream.index] = _like(out, stream, form)
                     streams[stream.index].time_base = stream.time_base
 
             def write(packet: Any) -> None:
@@ -195,6 +195,16 @@ def _remuxed(av: Any, container: Any, target: Path, form: str, notes: list[str])
             return _copied(av, container, write, notes)
     except (av.error.FFmpegError, ValueError) as error:
         raise InputError("The copy of the video cannot be written.", file=target, found=str(error)) from error
+
+
+def _like(out: Any, stream: Any, form: str) -> Any:
+    """A stream of the new file for the packets of one of the old file."""
+    codec = stream.codec_context
+    if form != "matroska" or codec.name != "rawvideo":
+        return out.add_stream_from_template(stream)
+    like = out.add_stream("rawvideo", rate=stream.average_rate or stream.guessed_rate or 30)
+    like.width, like.height, like.pix_fmt = codec.width, codec.height, codec.pix_fmt  # no template tells it
+    return like
 
 
 def _stream(stream: Any, count: _Count) -> SavedStream:

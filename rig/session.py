@@ -222,7 +222,7 @@ class Session:
             Check(
                 "disk", minutes >= _LEAST_MINUTES,
                 f"{gigabytes(free)} are free, {self.rig.storage.reserve_gb:g} GB of them are kept: "
-                f"room for {minutes:.0f} min",
+                f"room for {int(minutes)} min",
                 "free some space, or choose another disk with --out", fatal=True,
             )
         ]  # fmt: skip

@@ -14,6 +14,7 @@ from rig_check_folders import IMAGE, IMU, INFO, POINTS, START, Faults, write_fol
 from acino_fte.data_tools.rig_recording import Event
 from acino_fte.rig.check import check_recording
 from acino_fte.rig.check_report import json_text, page, write_files
+from acino_fte.rig.check_types import DAMAGED
 
 FAULTS = Faults(
     stalls={INFO: (4.0, 2.0), IMU: (7.5, 1.5)},
@@ -237,6 +238,18 @@ def test_what_was_on_its_way_when_a_recording_was_cut_short_is_explained(tmp_pat
     check = check_recording(path)
     assert [gap.lost for gap in check.found.streams[IMAGE].gaps] == [1, 2]
     assert len(check.unexplained) == n_unexplained
+
+
+def test_a_lost_or_empty_file_explains_what_is_missing(tmp_path):
+    path = write_folder(tmp_path / "rig", seconds=6.0, segment_s=2.0)
+    (path / "cam1-0000.mkv").write_bytes(b"")
+    (path / "messages-0001.mcap").unlink()
+    check = check_recording(path)
+    assert check.verdict == "fail" and check.unexplained == ()
+    assert {gap.explained for stream in check.found.streams.values() for gap in stream.gaps} == {DAMAGED}
+    assert [any(n in p for p in check.found.damage.places) for n in ("cam1-0000", "messages-0001")] == [
+        True
+    ] * 2
 
 
 @pytest.mark.parametrize("name", ["messages-0001.mcap", "messages-0000.mcap"])

@@ -97,7 +97,7 @@ def test_any_part_of_the_pictures_across_segments(whole):
         assert reader.single_video(IMAGE) is None
 
 
-def test_without_its_manifest(folder):
+def test_without_its_manifest(whole, folder):
     (folder / MANIFEST).unlink()
     with open_recording(folder) as reader:
         assert {s.name: s.count for s in reader.streams} == COUNTS
@@ -106,6 +106,10 @@ def test_without_its_manifest(folder):
     with open_recording(folder) as reader:
         assert len(list(reader.records(kinds=["lidar"]))) == 40
         assert "damaged" in reader.notes[0]
+    text = (whole / MANIFEST).read_text()
+    (folder / MANIFEST).write_text(text.replace("rig-recording/1", "rig-recording/2"))
+    with open_recording(folder) as reader:
+        assert "another version" in reader.notes[0]
 
 
 def test_a_cut_segment_gives_what_is_whole_and_the_others_all(folder):

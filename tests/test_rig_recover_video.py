@@ -126,3 +126,26 @@ def test_an_mp4_that_cannot_be_rebuilt_is_said(tmp_path):
     with pytest.raises(InputError, match="head is lost"):
         recover(tmp_path / "lost.mkv")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lost.mkv", "lost.mp4"]
+
+
+@pytest.mark.parametrize("bits, width", [(8, 63), (12, 64)])
+def test_a_cut_video_of_every_pixel_is_copied(bits, width, tmp_path):
+    """As the recorder writes it with ``codec: raw``: raw pixels, lossless where these are deeper."""
+    from acino_fte.rig.rig_file import CameraPart
+    from acino_fte.rig.writers_video import VideoFile, choose_codec
+
+    part = CameraPart(width=width, height=47, bits=bits, codec="raw", fps=FPS)
+    pixels = (
+        np.random.default_rng(0).integers(0, 1 << bits, (20, 47, width)).astype(f"uint{8 * (1 + (bits > 8))}")
+    )
+    path = tmp_path / "cam1-0000.mkv"
+    video = VideoFile(path, "cam1", part, choose_codec(part), 0, pixels[0])
+    for i, picture in enumerate(pixels):
+        video.write(picture, round(i * 1e9 / FPS))
+    video.close()
+    whole = decoded(path)
+    path.write_bytes(path.read_bytes()[: int(0.6 * path.stat().st_size)])
+    found = recover(path, tmp_path / "copy.mkv")
+    n = len(packets(path))
+    assert found.saved == n > 5
+    assert decoded(tmp_path / "copy.mkv") == whole[:n]
