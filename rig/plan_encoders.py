@@ -25,8 +25,10 @@ def step_deg(counts: float) -> float:
 def step_cm(counts: float, range_m: float) -> float:
     """Way of the optical axis at a range (m) in one count, cm: r tan(2π / counts).
 
-    4000 counts are 0.09°, or 14 cm at 90 m.
+    4000 counts are 0.09°, or 14 cm at 90 m. With up to four counts a turn it is infinite.
     """
+    if counts <= 4.0:
+        return math.inf
     return 100.0 * range_m * math.tan(2.0 * math.pi / counts)
 
 

@@ -133,7 +133,10 @@ def _fields(axes: Axes, plan: RigPlan, one: CameraPlan) -> None:
             size = (width * times, height * times)
             corner = (-0.5 * size[0], -0.5 * size[1])
             axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, lw=1, ls="--"))
-            axes.text(corner[0], -corner[1], f" {focal:.3g} mm", va="bottom", fontsize=8, color=colour)
+            wide = colour == ORANGE  # its upper side meets the ellipse: named beside it, the other above
+            (x, y), side = ((-corner[0], 0.0), "center") if wide else ((corner[0], -corner[1]), "bottom")
+            axes.text(x, y, f" {focal:.3g} mm", va=side, fontsize=8, color=colour)
+            size = (1.8 * size[0], size[1]) if wide else size
             reach = [max(old, 0.5 * new) for old, new in zip(reach, size, strict=True)]
     axes.add_patch(Rectangle((-0.5 * width, -0.5 * height), width, height, fill=False, edgecolor="k", lw=1.4))
     axes.annotate(

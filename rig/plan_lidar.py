@@ -1,7 +1,8 @@
 """Formulas of a lidar beside a camera: what both see, and how many returns an animal gives.
 
 The field of the lidar is an ellipse about the camera's optical axis, and its points are spread evenly over it
-in the time of a frame. (The pattern of a Livox does not repeat; it is somewhat denser in the middle.)
+in the time of a frame. (The pattern of a Livox Tele-15 does not repeat, and is denser in the middle: there an
+animal gets more than the mean that is counted with, at the edge fewer.)
 """
 
 from __future__ import annotations

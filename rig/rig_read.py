@@ -15,6 +15,7 @@ from acino_fte.rig.rig_file import FILE_NAME, FORMAT, RigFile
 from acino_fte.species_file import read_yaml, validation_message
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_SMALLEST, _LARGEST = 1e-9, 1e12
 _HEADER = """\
 # A rig: what it is made of, and what a recording with it is to reach.
 # Whatever is left out has the value that a new file shows (acino-fte rig plan --init).
@@ -100,6 +101,7 @@ def checked_rig(data: dict[str, Any], path: Path | None = None) -> RigFile:
 
 def _faults(rig: RigFile) -> Iterator[tuple[str, str, str, str]]:
     """What the schema cannot say: key, problem, expected, found."""
+    yield from _size_faults("", rig)
     yield from _name_faults(rig)
     for name, camera in rig.cameras.items():
         lens, key = camera.lens, f"cameras.{name}.lens"
@@ -119,6 +121,20 @@ def _faults(rig: RigFile) -> Iterator[tuple[str, str, str, str]]:
         if not all(0 < angle < 180 for angle in lidar.fov_deg):
             found = str(list(lidar.fov_deg))
             yield f"lidars.{name}.fov_deg", "The lidar has no such field.", "0 to 180 degrees", found
+
+
+def _size_faults(place: str, value: Any) -> Iterator[tuple[str, str, str, str]]:
+    """Numbers of which no rig can have one: a zero too many would end in an overflow, not in a plan."""
+    if isinstance(value, BaseModel):
+        value = dict(value)
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _size_faults(f"{place}.{key}".removeprefix("."), item)
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from _size_faults(place, item)
+    elif isinstance(value, int | float) and value and not _SMALLEST <= abs(value) <= _LARGEST:
+        yield place, "No rig has such a number.", f"{_SMALLEST:g} to {_LARGEST:g}", f"{value:g}"
 
 
 def _name_faults(rig: RigFile) -> Iterator[tuple[str, str, str, str]]:

@@ -114,6 +114,7 @@ def test_4741_44_counts_a_turn_and_0_09_degrees_are_14_cm_at_90_m():
     assert step_deg(counts) == pytest.approx(0.09)
     assert round(step_cm(counts, 90)) == 14
     assert counts_for_step(step_cm(counts, 90), 90) == pytest.approx(counts)
+    assert [step_cm(few, 90) for few in (1, 3, 4)] == [math.inf] * 3  # not a negative step
     planned = {one.name: one for one in plan_rig(changed(distance_m=90)).encoders}
     assert round(planned["pan"].step_cm) == 14
     assert planned["zoom"].step_cm is None
