@@ -253,11 +253,13 @@ def devices() -> dict[str, Any]:
 
     Drivers are loaded; no device is opened.
     """
+    found: dict[str, Any] = {"file": "", "devices": {}, "faults": [], "remedy": ""}
+    if not Path("rig.yaml").exists():  # what follows imports NumPy, and more
+        return found
     from acino_fte.errors import InputError
     from acino_fte.rig.rig_read import find_rig_file, read_rig
     from acino_fte.rig.sources import SIMULATED, find_driver
 
-    found: dict[str, Any] = {"file": "", "devices": {}, "faults": [], "remedy": ""}
     try:
         file = find_rig_file()
         if file is None:

@@ -7,7 +7,8 @@ from contextlib import chdir
 from pathlib import Path
 
 import pytest
-from test_new_species_tutorial import blocks, execute
+from rig_commands import execute
+from test_new_species_tutorial import blocks
 from typer.testing import CliRunner
 
 from acino_fte.cli_rig import app
