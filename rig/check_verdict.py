@@ -94,7 +94,8 @@ def _readable(found: Findings) -> Requirement:
 def _closed(found: Findings) -> Requirement:
     if found.manifest is None:
         return Requirement(
-            "closed", "the recording", "warn", "its manifest is lost, damaged or of another version", "closed",
+            "closed", "the recording", "warn", "its manifest is lost, damaged or of another version",
+            "closed",
             "what the recorder noted is not known; acino-fte rig recover makes a new manifest",
         )  # fmt: skip
     state = found.manifest.state

@@ -176,7 +176,7 @@ class Watch:
         event = self._log.get(self._silence)
         seconds = max(now_ns - event.time_ns, 0) * 1e-9
         if event.kind == "unplugged" or self._device_ns is None:
-            missing = round(seconds * 1e9 / self._period_ns)
+            missing = max(round((now_ns - self._last_ns) / self._period_ns) - 1, 0)
         detail = event.detail.removesuffix("; it still lasts")
         if event.kind == "stall" and not missing:
             detail = "late, but nothing is missing"

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from acino_fte.rig.writers_video import VideoFile
 
 _STOP = object()
+_MOST_BAD = 20
 _PATIENCE_S = 0.5  # of one try to put something into a full queue
 
 
@@ -54,7 +55,7 @@ class SensorWriter(Thread):
     paced : bool
         Wait where the queue is full (virtual clock); else what does not fit is dropped, and counted.
     failed : callable
-        Called, once, with the error that ended it.
+        Called with the error that ended it, and with those of things that were left out.
     """
 
     def __init__(self, name: str, size: int, paced: bool, failed: Callable[[Exception], None]) -> None:
@@ -64,6 +65,7 @@ class SensorWriter(Thread):
         self._segment: OpenSegment | None = None
         self.written: dict[str, int] = {}
         self.broken = False
+        self._bad = 0  # in a row, that could not be written
 
     @property
     def fill(self) -> float:
@@ -121,7 +123,7 @@ class SensorWriter(Thread):
                 elif isinstance(item, Flag):
                     item.set()
                 elif self._segment is not None:
-                    self.write(item, self._segment)
+                    self._write_one(item, self._segment)
             self._leave()
         except Exception as error:  # noqa: BLE001 - whatever it is, the recorder must know
             self.broken = True
@@ -130,6 +132,17 @@ class SensorWriter(Thread):
                 self._leave()
             while not self._queue.empty():  # nobody waits for room in a queue that nobody empties
                 self._queue.get_nowait()
+
+    def _write_one(self, item: Stamped, segment: OpenSegment) -> None:
+        """Write one thing; a few that cannot be, as NaN where a number must be, are told and left out."""
+        try:
+            self.write(item, segment)
+            self._bad = 0
+        except (ValueError, TypeError, OverflowError) as error:
+            self._bad += 1
+            if self._bad > _MOST_BAD or isinstance(error, OSError):
+                raise
+            self._failed(error)
 
     def _leave(self) -> None:
         if self._segment is not None:
@@ -190,8 +203,8 @@ class CameraWriter(SensorWriter):
         if self._video is None:
             self._video = segment.open_video(self.device, self._part, self._codec, picture.pixels)
         topic, info = camera_topic(self.device), replace(info, encoders=item.counts)
+        segment.messages.write(topic, info, item.log_ns, item.wall_ns, self.device)  # first: it may fail
         self._video.write(picture.pixels, item.log_ns)
-        segment.messages.write(topic, info, item.log_ns, item.wall_ns, self.device)
         self.count(self.device)
         self.count(topic)
 

@@ -110,6 +110,28 @@ def test_messages_of_all_streams_lie_together(faulty):
         assert (np.maximum.accumulate(logs) - logs).max() < 0.25e9, path
 
 
+def test_what_cannot_be_written_is_told_and_the_sensor_goes_on(tmp_path, monkeypatch):
+    """A driver that once says NaN where a number must be."""
+    from acino_fte.rig.simulated_camera import SimulatedCamera
+
+    sample = SimulatedCamera.sample
+
+    def odd(self, stream, number, device_ns):
+        found = sample(self, stream, number, device_ns)
+        return replace(found, info=replace(found.info, exposure_us=np.nan)) if number in (9, 10) else found
+
+    monkeypatch.setattr(SimulatedCamera, "sample", odd)
+    rig = RigFile(cameras={"cam1": CameraPart(width=64, height=48)}, lidars={})
+    _, manifest, _ = record(tmp_path / "rig", seconds=1.0, rig=rig)
+    assert [(s.received, s.written) for s in manifest.streams] == [(60, 58)] * 2
+    (error,) = [event for event in manifest.events if event.kind == "error"]
+    assert "NaN" in error.detail and error.stream == "cam1"
+    assert any("2 were received and not written" in text for text in unexplained(manifest))
+    with open_recording(tmp_path / "rig") as reader:
+        shown = {stream.name: stream.count for stream in reader.streams}
+    assert shown == {"/cam1/info": 58, "/cam1/image": 58}
+
+
 def test_counts_of_the_encoders_come_with_every_image(faulty):
     folder, _, manifest, _ = faulty
     with open_recording(folder) as reader:

@@ -88,6 +88,17 @@ def test_a_stall_that_turns_out_to_be_an_unplugged_device():
     assert event.seconds == pytest.approx(1.0)
 
 
+def test_what_an_unplugged_device_misses_is_counted_from_when_it_was_due():
+    log = EventLog()
+    watch = Watch("cam1", 100.0, log, T0)
+    for at, number, device in steady(0, 20):
+        watch.received_at(T0 + at * MS, number, device * MS)
+    watch.gone(T0 + 192 * MS, "unplugged")
+    watch.received_at(T0 + 500 * MS, 0, 0)
+    (event,) = log.all()
+    assert (event.time_ns, event.count) == (T0 + 192 * MS, 30)  # due at 200, 210, ... 490 ms
+
+
 def test_a_stream_that_never_begins_is_silent_from_the_start():
     events, _ = watched([], close=2000)
     assert events == [("stall", 0, 2.0, 200)]
