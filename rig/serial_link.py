@@ -233,6 +233,6 @@ def open_port(path: str | None) -> Port:
 def _short(error: Exception) -> str:
     """What went wrong, without the address of it."""
     if isinstance(error, InputError):
-        return f"{error.problem} {error.remedy or ''}".strip().removesuffix(".")
+        return error.problem.removesuffix(".") + (f": {error.remedy}" if error.remedy else "")
     text = getattr(error, "strerror", None) or str(error)
     return text.split("\n")[0]
