@@ -11,7 +11,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import gettempdir
@@ -242,6 +242,12 @@ class Session:
             except DeviceGone as error:
                 text = "the others are recorded; it is tried again all the time"
                 checks.append(Check(source.name, False, f"does not answer ({error})", text))
+                continue
+            except Exception as error:  # noqa: BLE001 - of a driver: the others are recorded
+                with suppress(Exception):
+                    source.close()
+                detail = f"its driver fails ({type(error).__name__}: {error})"
+                checks.append(Check(source.name, False, detail, "the others are recorded"))
                 continue
             self.equipment.connected.add(source.name)
             detail = source.describe() if not silent else f"answers, but nothing comes on {', '.join(silent)}"

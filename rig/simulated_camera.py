@@ -67,7 +67,7 @@ def burn_number(pixels: np.ndarray, number: int) -> None:
     side = _side(pixels.shape)
     bits = (number >> np.arange(BITS - 1, -1, -1)) & 1
     white = 255 if pixels.dtype == np.uint8 else int(pixels.max())
-    pixels[:side, : BITS * side] = np.repeat(bits * white, side)
+    pixels[:side, : BITS * side] = np.repeat(bits * white, side)[: pixels.shape[1]]
 
 
 def burnt_number(pixels: np.ndarray) -> int:

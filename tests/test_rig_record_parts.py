@@ -274,6 +274,29 @@ class Missing:
         return "a test camera"
 
 
+def test_a_driver_that_fails_is_told_and_the_others_are_recorded(tmp_path, monkeypatch):
+    class Broken(Missing):
+        def open(self):
+            raise RuntimeError("no such library")
+
+    parts = {name: CameraPart(width=20, height=16, device=name, fps=50.0) for name in ("broken", "sound")}
+    rig = RigFile(name=tmp_path.name, cameras=parts, lidars={}, encoders={})
+    monkeypatch.setitem(sources.DRIVERS, "broken", Broken)
+    monkeypatch.setitem(
+        sources.DRIVERS,
+        "sound",
+        lambda name, p: SimulatedRig(RigFile(cameras={name: p}, lidars={})).sources[0],
+    )
+    session = Session(rig, tmp_path / "a", SessionOptions(probe=False))
+    checks = {check.name: check for check in session.preflight()}
+    assert not checks["broken"].passed and "no such library" in checks["broken"].detail
+    manifest = session.record(0.3)
+    assert {s.name: s.written > 0 for s in manifest.streams if s.kind == "image"} == {
+        "broken": False, "sound": True
+    }  # fmt: skip
+    assert any(e.kind == "error" and e.stream == "broken" for e in manifest.events)
+
+
 def test_a_device_that_does_not_answer_is_told_and_joins_when_it_comes(tmp_path, monkeypatch):
     """In real time: preflight warns, the other device is recorded, the missing one from when it is there."""
     part = CameraPart(width=64, height=48, device="missing", fps=50.0)
