@@ -141,7 +141,7 @@ def _loss(stream: StreamAccount) -> Requirement:
     if not stream.count:
         return Requirement(
             "no loss", stream.name, "fail", "no messages at all", "0 lost",
-            "check that the device is switched on and connected, and that the recorder was not stopped at once",
+            "is the device on and connected, and was the recorder not stopped at once?",
         )  # fmt: skip
     longest = max((gap.seconds for gap in stream.gaps), default=0.0)
     found = f"0 of {stream.expected} lost"
