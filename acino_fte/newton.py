@@ -25,6 +25,7 @@ from acino_fte.condensed import Condensed
 
 _DECREASE = 1e-4  # σ of Armijo's rule
 _HALVINGS = 12
+_DAMPINGS = (1e-9, 1e-6, 1e-3)  # of a singular Hessian, relative to the mean of its diagonal
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,35 +127,44 @@ def _step(
 def _downhill(
     condensed: Condensed, x: np.ndarray, gradient: np.ndarray, held: np.ndarray
 ) -> np.ndarray | None:
-    """A Newton step, or a Gauss–Newton step where the exact Hessian is not positive definite."""
+    """A Newton step; where the exact Hessian bends down, Gauss–Newton's, damped where that is singular."""
     exact = condensed.exact
     try:
         return newton_step(condensed, x, gradient, held)
     except NotPositiveDefinite:
-        if not exact:
-            return None
-    condensed.use_exact(False)
+        condensed.use_exact(False)
     try:
-        return newton_step(condensed, x, gradient, held)
-    except NotPositiveDefinite:
-        return None
+        for damping in (0.0, *_DAMPINGS) if exact else _DAMPINGS:
+            try:
+                return newton_step(condensed, x, gradient, held, damping)
+            except NotPositiveDefinite:
+                continue
     finally:
-        condensed.use_exact()
+        condensed.use_exact(exact)
+    return None
 
 
-def newton_step(condensed: Condensed, x: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """−H⁻¹g (K,) over the variables that are not `held` (K,); zero for those that are.
+def newton_step(
+    condensed: Condensed, x: np.ndarray, gradient: np.ndarray, held: np.ndarray, damping: float = 0.0
+) -> np.ndarray:
+    """−(H + δ μ I)⁻¹ g (K,) over the variables that are not `held` (K,); zero for those that are.
+
+    δ is the `damping`, and μ the mean of the diagonal of H.
 
     Raises
     ------
     NotPositiveDefinite
-        The Hessian is not, over those variables.
+        The matrix is not, over those variables.
     """
     n, size = condensed.shape
     sd = condensed.problem.parameters.sd
     blocks, arrow, corner = condensed.hessian_parts(x)
     free = ~held
     state, rest = free[: n * size].reshape(n, size), free[n * size :]
+    if damping:
+        shift = damping * float(np.einsum("nii->", blocks[0])) / (n * size)
+        blocks = [blocks[0] + shift * np.eye(size), *blocks[1:]]
+        corner = corner + np.diag(shift / sd**2)
     if held.any():
         blocks = [_held_block(block, state, lag) for lag, block in enumerate(blocks)]
         arrow = arrow * state[:, :, None] * rest

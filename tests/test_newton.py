@@ -114,6 +114,25 @@ def test_gauss_newton_steps_where_the_exact_hessian_bends_down(recording, monkey
     assert condensed.exact
 
 
+def test_a_singular_hessian_is_damped(lizard, recording):
+    """Two frames seen of eight: three modes of the motion are free, and steps lead down nevertheless."""
+    problem, start = recording
+    sequence = problem.sequence
+    unseen = np.isin(sequence.frames, [3, 4], invert=True)
+    pixels = sequence.detections.position.values.copy()
+    pixels[unseen] = np.nan
+    few = make_sequence(lizard, start, sequence.cameras, pixels=pixels)
+    condensed = Condensed(unlimited(build_fte(few, lizard, FTEOptions(fit=()))))
+    x = condensed.pack(start + 0.05, np.zeros(0))
+    held = np.zeros(x.size, dtype=bool)
+    with pytest.raises(NotPositiveDefinite):
+        newton_step(condensed, x, condensed.gradient(x), held)
+    far = np.full(x.size, 1e20)
+    found = approach(condensed, x, -far, far, Limits(30, 1e-3))
+    assert found.converged
+    assert found.value < 0.1 * condensed.objective(x)
+
+
 def test_no_way_down_is_no_error(recording, monkeypatch):
     condensed, x, bound = condensed_at(recording)
     monkeypatch.setattr(newton, "newton_step", lambda _, x, gradient, held: gradient)
