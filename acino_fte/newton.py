@@ -7,9 +7,10 @@ simple constraints*):
 
     F = {i : not held},   s_F = −H_FF⁻¹ g_F,   x(α) = clip(x + α s, l, u),
 
-with the first α of 1, ½, ¼, … that lowers f by σ·gᵀ(x − x(α)). A general sparse solver has to find
-this structure again in every iteration, and IPOPT has to bend its path around the bounds from far away; from
-where these steps end, it has little or nothing left to do.
+with the first α that lowers f by σ·gᵀ(x − x(α)), of 1 and then minima of parabolas through what was tried.
+A general sparse solver has to find this structure again in every iteration, and IPOPT has to bend its path
+around the bounds from far away; from where these steps end, it has little or nothing left to do. A singular
+H, of a motion that the data do not hold everywhere, is damped (Levenberg 1944).
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from acino_fte.arrow import ArrowFactor, NotPositiveDefinite
 from acino_fte.condensed import Condensed
 
 _DECREASE = 1e-4  # σ of Armijo's rule
-_HALVINGS = 12
+_TRIALS = 12
+_SHORTER = (0.1, 0.5)  # times the length, at least and at most, after a trial that does not lower enough
 _DAMPINGS = (1e-9, 1e-6, 1e-3)  # of a singular Hessian, relative to the mean of its diagonal
 
 
@@ -116,11 +118,14 @@ def _step(
     step = _downhill(condensed, x, gradient, held)
     if step is None:
         return None
-    for halving in range(_HALVINGS):
-        there = np.clip(x + 0.5**halving * step, *bounds)
-        lowered = condensed.objective(there)
-        if value - lowered >= _DECREASE * (gradient @ (x - there)) > 0:
+    length = 1.0
+    for _ in range(_TRIALS):
+        there = np.clip(x + length * step, *bounds)
+        lowered, promised = condensed.objective(there), float(gradient @ (x - there))
+        if value - lowered >= _DECREASE * promised > 0:
             return there, lowered
+        bend = lowered - value + promised  # of the parabola through both values, with the slope here
+        length *= min(max(0.5 * promised / bend, _SHORTER[0]), _SHORTER[1]) if bend > 0 else _SHORTER[1]
     return None
 
 
